@@ -1,0 +1,266 @@
+//! What goes into an agent and what comes out: the whole contract between the core and its shells.
+
+use super::job::{Job, JobResult};
+use crate::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
+use crate::submap::Keyframe;
+use crate::time::Stamp;
+use serde::{Deserialize, Serialize};
+
+/// The three broadcast channels (DESIGN §5).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Channel {
+    /// Live pose beacons: best effort, latest wins.
+    Pose,
+    /// New entries, once.
+    Facts,
+    /// Root hashes.
+    Have,
+}
+
+/// The three questions one robot asks another.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum QueryKind {
+    /// "Here is my have-vector; what am I missing?"
+    Sync,
+    /// "Give me the blob with this hash."
+    Blob,
+    /// "I think these two submaps overlap; please look."
+    Align,
+}
+
+/// A question of ours, chosen by the core; unique within one run of an agent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct QueryId(pub u64);
+
+/// A question of a peer's, chosen by the shell; the core hands it back with the answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct AskToken(pub u64);
+
+/// A piece of heavy work; unique within one run of an agent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct JobId(pub u64);
+
+/// Everything that can happen to an agent.
+#[derive(Clone, Debug)]
+pub enum Input {
+    /// The robot's own SLAM finished a keyframe.
+    Keyframe(Keyframe),
+    /// The robot's own sensors measured another robot directly.
+    Sighting(Sighting),
+    /// A broadcast arrived. `from` is the robot the key names (a hint for statistics, not proof).
+    Received {
+        /// Whose key it came on.
+        from: RobotId,
+        /// On which channel.
+        channel: Channel,
+        /// The framed message.
+        bytes: Vec<u8>,
+    },
+    /// A peer asks. Every `Asked` is answered by exactly one [`Output::Answer`].
+    Asked {
+        /// To be handed back.
+        token: AskToken,
+        /// What kind of question.
+        kind: QueryKind,
+        /// The framed message.
+        bytes: Vec<u8>,
+    },
+    /// Our question was answered, or failed or timed out in the shell (`None`).
+    Answered {
+        /// Which question.
+        query: QueryId,
+        /// The framed answer.
+        bytes: Option<Vec<u8>>,
+    },
+    /// A peer appeared or vanished (liveliness).
+    Neighbour {
+        /// Which robot.
+        robot: RobotId,
+        /// Whether it is reachable now.
+        up: bool,
+    },
+    /// All [`Output::Persist`] batches up to and including this number are durable.
+    Persisted {
+        /// The batch number.
+        up_to: u64,
+    },
+    /// The store could not write (disk full, I/O error): the agent stops writing facts and says so.
+    PersistFailed {
+        /// The first batch that is not durable.
+        batch: u64,
+        /// What the store said.
+        reason: String,
+    },
+    /// A job finished.
+    JobDone {
+        /// Which.
+        job: JobId,
+        /// With what.
+        result: JobResult,
+    },
+    /// The moment that `poll_timeout` named has come (harmless at any other time).
+    Timeout,
+    /// The operator or the shell wants something.
+    Command(Command),
+}
+
+/// A direct relative measurement of another robot's body.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Sighting {
+    /// When.
+    pub stamp: Stamp,
+    /// Who was seen.
+    pub robot: Name,
+    /// `t_body_other`: translation `[x, y, z]` m, quaternion `[x, y, z, w]`.
+    pub t_body_other: [f64; 7],
+    /// Row-major upper triangle of the 6×6 covariance of the local perturbation (ρ, φ).
+    pub covariance: [f64; 21],
+}
+
+/// What an operator or a shell can ask for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Command {
+    /// The recording ended or the robot parks: close the open submap now.
+    Flush,
+    /// The robot's SLAM restarted in a new local frame: begin a new epoch.
+    NewEpoch,
+}
+
+/// Everything an agent can want.
+#[derive(Clone, Debug)]
+pub enum Output {
+    /// Make these records durable, then say [`Input::Persisted`]. Batches are numbered from 1 without holes.
+    Persist {
+        /// Number of this batch.
+        batch: u64,
+        /// What to store.
+        records: Vec<Record>,
+    },
+    /// Broadcast.
+    Publish {
+        /// On which channel.
+        channel: Channel,
+        /// The framed message.
+        bytes: Vec<u8>,
+    },
+    /// Ask one peer; answer with [`Input::Answered`] in any case.
+    Ask {
+        /// To be handed back.
+        query: QueryId,
+        /// Whom.
+        peer: RobotId,
+        /// What kind of question.
+        kind: QueryKind,
+        /// The framed message.
+        bytes: Vec<u8>,
+    },
+    /// Answer a peer's question.
+    Answer {
+        /// Which.
+        token: AskToken,
+        /// The framed message.
+        bytes: Vec<u8>,
+    },
+    /// Run heavy work ([`Job::run`]) off the core's thread; answer with [`Input::JobDone`].
+    Run {
+        /// To be handed back.
+        id: JobId,
+        /// The work: a pure function of its data.
+        job: Job,
+    },
+    /// Something people may want to know.
+    Event(Event),
+}
+
+/// A durable record. Writing the same record twice is harmless.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Record {
+    /// A signed log entry.
+    Entry {
+        /// Its place.
+        id: EntryId,
+        /// Its canonical bytes.
+        bytes: Vec<u8>,
+    },
+    /// A content-addressed keypoint blob.
+    Blob {
+        /// Its address.
+        hash: Hash,
+        /// Its bytes.
+        bytes: Vec<u8>,
+    },
+    /// Something of this robot's own that is never sent (all features and the thinned cloud of one own submap).
+    Private {
+        /// Which submap.
+        submap: SubmapId,
+        /// Encoded features and cloud.
+        bytes: Vec<u8>,
+    },
+}
+
+/// Something people may want to know. Shells log it; tests assert on it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// One of our submaps was finished and described.
+    SubmapFinished {
+        /// Which.
+        submap: SubmapId,
+        /// Keypoints offered.
+        keypoints: usize,
+    },
+    /// We computed an alignment and stated it.
+    AlignmentProposed {
+        /// Target.
+        i: SubmapId,
+        /// Source.
+        j: SubmapId,
+        /// Σ of inlier probabilities.
+        support: f64,
+    },
+    /// Both endpoints agree on an alignment.
+    AlignmentAgreed {
+        /// Target.
+        i: SubmapId,
+        /// Source.
+        j: SubmapId,
+    },
+    /// The two endpoints do not agree.
+    AlignmentDisputed {
+        /// Target.
+        i: SubmapId,
+        /// Source.
+        j: SubmapId,
+    },
+    /// A frame joined ours.
+    Merged {
+        /// The frame.
+        frame: FrameId,
+    },
+    /// A frame left ours: its alignments no longer hold.
+    Unmerged {
+        /// The frame.
+        frame: FrameId,
+    },
+    /// Bad input was refused. Rate-limited: `suppressed` counts the like since the last report.
+    Rejected {
+        /// From whom, as far as known.
+        peer: Option<RobotId>,
+        /// What was wrong.
+        reason: String,
+        /// Refusals of the same peer not reported one by one.
+        suppressed: u64,
+    },
+    /// Storage failed; the agent no longer writes facts of its own.
+    ReceiveOnly {
+        /// Why.
+        reason: String,
+    },
+    /// A new epoch, hence a new frame, began.
+    EpochBegan {
+        /// Its frame.
+        frame: FrameId,
+    },
+}

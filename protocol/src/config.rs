@@ -1,0 +1,206 @@
+//! Everything about the core that can be tuned. Each knob says what it means, how it relates to the others and how to
+//! choose it; [`Config::validate`] refuses what cannot work.
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// The core's configuration. Lengths are in metres, times in seconds, angles in degrees where the name says so.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Cutting keyframes into submaps and describing them.
+    pub submap: SubmapConfig,
+    /// Aligning pairs of submaps.
+    pub align: AlignConfig,
+    /// Merging frames and solving the joint estimate.
+    pub estimate: EstimateConfig,
+    /// Replication.
+    pub gossip: GossipConfig,
+}
+
+/// How keyframes become submaps.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SubmapConfig {
+    /// Edge of the thinning voxel. Choose the sensor's noise times three or so: 0.05 for depth cameras, 0.5 for
+    /// spinning LiDAR outdoors.
+    pub voxel_m: f64,
+    /// A submap ends after the robot moved this far...
+    pub distance_m: f64,
+    /// ...or turned this much...
+    pub rotation_deg: f64,
+    /// ...or after this many keyframes.
+    pub keyframes_max: u32,
+    /// Points kept per submap after thinning (memory bound).
+    pub points_max: usize,
+    /// Keypoints offered to others. 256 is 6.9 kB.
+    pub keypoints: usize,
+    /// Whether frame units are metres.
+    pub scale: crate::wire::fact::ScaleKind,
+    /// Odometry standard deviation assumed across a gap in the keyframes, per metre travelled.
+    pub gap_sigma_per_m: f64,
+}
+
+impl Default for SubmapConfig {
+    fn default() -> Self {
+        Self {
+            voxel_m: 0.1,
+            distance_m: 2.0,
+            rotation_deg: 60.0,
+            keyframes_max: 10,
+            points_max: 20_000,
+            keypoints: 384,
+            scale: crate::wire::fact::ScaleKind::Metric,
+            gap_sigma_per_m: 0.1,
+        }
+    }
+}
+
+/// How two submaps are aligned.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AlignConfig {
+    /// Upper bound of the unknown noise scale of correspondences, in voxels. The estimate of the noise itself is
+    /// marginalised below this.
+    pub sigma_max_voxels: f64,
+    /// An alignment needs log₁₀ NFA below this.
+    pub log10_nfa_max: f64,
+    /// ...and at least this support (sum of inlier probabilities).
+    pub support_min: f64,
+    /// ...and at least this share of keypoints with a counterpart in the other cloud.
+    pub fit_min: f64,
+    /// Pairs worked on at once.
+    pub jobs_max: usize,
+    /// Candidate pairs remembered.
+    pub candidates_max: usize,
+    /// Similarity of summaries (0 to 1) from which a pair is a candidate.
+    pub similarity_min: f64,
+}
+
+impl Default for AlignConfig {
+    fn default() -> Self {
+        Self {
+            sigma_max_voxels: 1.5,
+            log10_nfa_max: -4.0,
+            support_min: 8.0,
+            fit_min: 0.2,
+            jobs_max: 2,
+            candidates_max: 4096,
+            similarity_min: 0.0,
+        }
+    }
+}
+
+/// When frames merge and how the joint estimate is solved.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EstimateConfig {
+    /// Mutually consistent, agreed alignments that two frames need before they merge. Below 3 a single mistake can
+    /// merge wrongly.
+    pub alignments_min: usize,
+    /// Frame-level log₁₀ NFA bound.
+    pub log10_nfa_max: f64,
+    /// Largest covariance scale tried when separating true from false alignments.
+    pub covariance_scale_max: f64,
+    /// Levenberg–Marquardt iterations at most.
+    pub iterations_max: usize,
+    /// Shortest time between two joint solves.
+    pub interval_secs: f64,
+}
+
+impl Default for EstimateConfig {
+    fn default() -> Self {
+        Self {
+            alignments_min: 3,
+            log10_nfa_max: -4.0,
+            covariance_scale_max: 3.0,
+            iterations_max: 50,
+            interval_secs: 0.25,
+        }
+    }
+}
+
+/// How facts spread.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GossipConfig {
+    /// Time between two `have` announcements.
+    pub have_secs: f64,
+    /// Time between two pose beacons.
+    pub pose_secs: f64,
+    /// Bytes of entries in one sync answer at most.
+    pub delta_bytes_max: usize,
+    /// How long an unanswered question is waited for.
+    pub answer_secs: f64,
+    /// Entries held per robot and epoch at most.
+    pub entries_per_frame_max: u32,
+    /// Epochs held per robot at most.
+    pub epochs_per_robot_max: usize,
+}
+
+impl Default for GossipConfig {
+    fn default() -> Self {
+        Self {
+            have_secs: 1.0,
+            pose_secs: 0.5,
+            delta_bytes_max: 64 * 1024,
+            answer_secs: 2.0,
+            entries_per_frame_max: 100_000,
+            epochs_per_robot_max: 64,
+        }
+    }
+}
+
+/// A configuration value that cannot work.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[error("{key} = {value}: {mend}")]
+pub struct ConfigError {
+    /// Dotted name of the key.
+    pub key: &'static str,
+    /// The value it has.
+    pub value: f64,
+    /// What it should be.
+    pub mend: &'static str,
+}
+
+impl Config {
+    /// Checks every knob.
+    ///
+    /// # Errors
+    /// [`ConfigError`] for the first value out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let (s, a, e, g) = (&self.submap, &self.align, &self.estimate, &self.gossip);
+        let range = |key, value: f64, low: f64, high: f64, mend| {
+            if value.is_finite() && (low..=high).contains(&value) {
+                Ok(())
+            } else {
+                Err(ConfigError { key, value, mend })
+            }
+        };
+        range("submap.voxel_m", s.voxel_m, 1e-3, 10.0, "use 0.001 to 10 m")?;
+        range("submap.distance_m", s.distance_m, 0.01, 1e4, "use 0.01 to 10000 m")?;
+        range("submap.rotation_deg", s.rotation_deg, 1.0, 1e6, "use at least 1 degree")?;
+        range("submap.keyframes_max", f64::from(s.keyframes_max), 1.0, 1e4, "use 1 to 10000")?;
+        range("submap.points_max", s.points_max as f64, 100.0, 1e6, "use 100 to 1000000 points")?;
+        range("submap.keypoints", s.keypoints as f64, 16.0, 1024.0, "use 16 to 1024 keypoints")?;
+        range("submap.gap_sigma_per_m", s.gap_sigma_per_m, 1e-4, 10.0, "use 0.0001 to 10")?;
+        range("align.sigma_max_voxels", a.sigma_max_voxels, 0.1, 10.0, "use 0.1 to 10 voxels")?;
+        range("align.log10_nfa_max", a.log10_nfa_max, -300.0, 0.0, "use a value from -300 to 0")?;
+        range("align.support_min", a.support_min, 3.0, 1e4, "use at least 3")?;
+        range("align.fit_min", a.fit_min, 0.0, 1.0, "use 0 to 1")?;
+        range("align.jobs_max", a.jobs_max as f64, 1.0, 64.0, "use 1 to 64")?;
+        range("align.candidates_max", a.candidates_max as f64, 1.0, 1e6, "use 1 to 1000000")?;
+        range("align.similarity_min", a.similarity_min, 0.0, 1.0, "use 0 to 1")?;
+        range("estimate.alignments_min", e.alignments_min as f64, 1.0, 1e3, "use 1 to 1000; 3 is safe")?;
+        range("estimate.log10_nfa_max", e.log10_nfa_max, -300.0, 0.0, "use a value from -300 to 0")?;
+        range("estimate.covariance_scale_max", e.covariance_scale_max, 1.0, 10.0, "use 1 to 10")?;
+        range("estimate.iterations_max", e.iterations_max as f64, 1.0, 1e4, "use 1 to 10000")?;
+        range("estimate.interval_secs", e.interval_secs, 0.0, 3600.0, "use 0 to 3600 s")?;
+        range("gossip.have_secs", g.have_secs, 0.01, 3600.0, "use 0.01 to 3600 s")?;
+        range("gossip.pose_secs", g.pose_secs, 0.01, 3600.0, "use 0.01 to 3600 s")?;
+        range("gossip.delta_bytes_max", g.delta_bytes_max as f64, 4096.0, 65536.0, "use 4096 to 65536 bytes")?;
+        range("gossip.answer_secs", g.answer_secs, 0.01, 600.0, "use 0.01 to 600 s")?;
+        range("gossip.entries_per_frame_max", f64::from(g.entries_per_frame_max), 1.0, 1e7, "use 1 to 10000000")?;
+        range("gossip.epochs_per_robot_max", g.epochs_per_robot_max as f64, 1.0, 1e4, "use 1 to 10000")
+    }
+}

@@ -1,0 +1,71 @@
+//! The recording format `merganser-recording`: what both the agent (which reads it) and the simulator (which writes it)
+//! agree on. Pure text: no file is opened here.
+//!
+//! A recording is a folder:
+//! - `recording.toml`: a [`Manifest`].
+//! - `keyframes.csv`: a header line ([`KEYFRAMES_HEADER`]), then one [`KeyframeLine`] per keyframe with rising stamps:
+//!   `stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,…,c55,cloud` (21 numbers of the covariance's upper triangle, tangent order
+//!   (ρ, φ), local perturbation).
+//! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, one per keyframe.
+//! - the clouds that the keyframes name, relative to the folder, points in the body frame.
+//!
+//! A data set for several robots is a folder whose sub-folders are recordings.
+
+use serde::{Deserialize, Serialize};
+
+/// The version of the format this code reads and writes.
+pub const VERSION: u32 = 1;
+/// The value of [`Manifest::format`].
+pub const FORMAT: &str = "merganser-recording";
+/// First line of `keyframes.csv`.
+pub const KEYFRAMES_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,c02,c03,c04,c05,c11,c12,c13,c14,c15,c22,c23,c24,c25,c33,c34,c35,c44,c45,c55,cloud";
+/// First line of `truth.csv`.
+pub const TRUTH_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw";
+/// Keyframes in one recording at most.
+pub const KEYFRAMES_MAX: usize = 1_000_000;
+
+/// `recording.toml`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// Always [`FORMAT`].
+    pub format: String,
+    /// Always [`VERSION`].
+    pub version: u32,
+    /// The robot's name.
+    pub robot: crate::ids::Name,
+    /// What made the points: free text for people, e.g. `lidar3d`, `depth`.
+    pub sensor: String,
+    /// What the covariance of a keyframe describes.
+    #[serde(default)]
+    pub covariance_of: crate::submap::CovarianceOf,
+    /// How clouds are stored.
+    pub clouds: CloudFormat,
+    /// Number of keyframes; must equal the lines of `keyframes.csv`.
+    pub keyframes: usize,
+    /// Where the data came from and what was laid on it (drift, cuts), for people.
+    #[serde(default)]
+    pub origin: String,
+    /// Overrides of the agent's core configuration that suit this sensor (e.g. `submap.voxel_m`).
+    #[serde(default)]
+    pub config: crate::config::Config,
+}
+
+/// How a cloud file is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CloudFormat {
+    /// PLY, ASCII or binary little-endian, vertex properties x, y, z (float or double; others are skipped).
+    Ply,
+    /// PCD with fields x, y, z.
+    Pcd,
+    /// KITTI velodyne: little-endian f32 x, y, z, intensity.
+    KittiBin,
+    /// Little-endian f32 x, y, z.
+    XyzBin,
+    /// Little-endian i16 x, y, z in units of 2 mm (±65 m), made by the simulator.
+    XyzI16,
+}
+
+/// Metres per unit of [`CloudFormat::XyzI16`].
+pub const XYZ_I16_UNIT_M: f64 = 0.002;

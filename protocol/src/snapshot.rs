@@ -1,0 +1,265 @@
+//! The debug view: what an agent believes, as plain serialisable values. Shells publish each view as JSON under
+//! `…/view/{status,frames,poses,map,graph,stats}`, so that any subscriber in any language can read the swarm's state.
+//!
+//! Poses are `{translation: [x, y, z], rotation: [x, y, z, w], scale}`; covariances are the row-major upper triangle of
+//! the local perturbation's covariance in the order (ρ, φ[, λ]): 21 numbers for a rigid pose, 28 for a similarity.
+
+use crate::geometry::{Relative, Se3, Sim3};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// All views at one moment.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Snapshot {
+    /// Who and how.
+    pub status: StatusView,
+    /// Frames and the relations between them.
+    pub frames: FramesView,
+    /// Live robots.
+    pub poses: PosesView,
+    /// Submap anchors.
+    pub map: MapView,
+    /// The factor graph.
+    pub graph: GraphView,
+    /// Counters.
+    pub stats: StatsView,
+}
+
+/// A pose or similarity as plain numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PoseView {
+    /// `[x, y, z]`.
+    pub translation: [f64; 3],
+    /// Unit quaternion `[x, y, z, w]`, w ≥ 0.
+    pub rotation: [f64; 4],
+    /// 1 for rigid motions.
+    pub scale: f64,
+}
+
+/// A pose with its uncertainty.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RelationView {
+    /// The mean.
+    pub pose: PoseView,
+    /// Upper triangle of the covariance (21 or 28 numbers).
+    pub covariance: Vec<f64>,
+    /// Standard deviations in tangent order (6 or 7 numbers).
+    pub sigmas: Vec<f64>,
+}
+
+/// `view/status`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StatusView {
+    /// The swarm.
+    pub swarm: String,
+    /// This robot.
+    pub robot: String,
+    /// Its id, hexadecimal.
+    pub id: String,
+    /// The epoch it writes.
+    pub epoch: u32,
+    /// Robots that are reachable now, by name.
+    pub neighbours: Vec<String>,
+    /// Entries held.
+    pub entries: u64,
+    /// BLAKE3 digest of the set of entries, hexadecimal.
+    pub digest: String,
+    /// Own submaps finished.
+    pub submaps: u64,
+    /// Keyframes taken.
+    pub keyframes: u64,
+    /// Pairs of submaps still to be tried by this robot, jobs running, records not yet durable.
+    pub pending: u64,
+    /// Nothing is pending and the joint estimate is of the present set.
+    pub idle: bool,
+    /// Names of robots of which at least one frame is merged with this robot's present frame.
+    pub merged_with: Vec<String>,
+    /// Storage failed: facts of our own are no longer written.
+    pub receive_only: bool,
+}
+
+/// `view/frames`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FramesView {
+    /// The frame that relations are given in: this robot's present frame, as `name/epoch`.
+    pub own: String,
+    /// Every known frame.
+    pub frames: Vec<FrameView>,
+    /// Every pair of frames that has at least one alignment.
+    pub pairs: Vec<PairView>,
+}
+
+/// One frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FrameView {
+    /// `name/epoch`.
+    pub frame: String,
+    /// The robot's name.
+    pub robot: String,
+    /// Submaps known.
+    pub submaps: u64,
+    /// Frames with the same number are connected by agreed alignments.
+    pub component: u64,
+    /// `t_own_frame`, if connected to our own frame.
+    pub t_own_frame: Option<RelationView>,
+}
+
+/// What is known about a pair of frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PairStatus {
+    /// Enough consistent alignments: part of the joint estimate.
+    Merged,
+    /// Agreed alignments, but fewer than needed.
+    Provisional,
+    /// Two rival groups of alignments.
+    Ambiguous,
+    /// Alignments contradict one another.
+    Inconsistent,
+}
+
+/// One pair of frames, `a < b`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PairView {
+    /// First frame, `name/epoch`.
+    pub a: String,
+    /// Second frame.
+    pub b: String,
+    /// Merged or why not.
+    pub status: PairStatus,
+    /// Alignments stated, by either side.
+    pub proposed: u64,
+    /// Alignments both endpoints agree on.
+    pub agreed: u64,
+    /// Alignments that the frame-level consensus keeps.
+    pub used: u64,
+    /// log₁₀ of the number of false alarms of the kept set.
+    pub log10_nfa: Option<f64>,
+    /// `t_a_b` of the joint estimate if merged, of the frame-level consensus otherwise.
+    pub t_a_b: Option<RelationView>,
+}
+
+/// `view/poses`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PosesView {
+    /// One per robot whose pose is known, this robot included.
+    pub robots: Vec<RobotView>,
+}
+
+/// A live robot.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RobotView {
+    /// Its name.
+    pub robot: String,
+    /// Seconds since its last beacon (or keyframe).
+    pub age_secs: f64,
+    /// Its stamp, s, on its own clock.
+    pub stamp_secs: f64,
+    /// The submap the beacon is relative to, `name/epoch#index`.
+    pub anchor: String,
+    /// `t_own_body`, if its frame is connected to ours.
+    pub t_own_body: Option<RelationView>,
+}
+
+/// `view/map`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MapView {
+    /// Every submap known.
+    pub submaps: Vec<SubmapView>,
+}
+
+/// A submap anchor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SubmapView {
+    /// `name/epoch`.
+    pub frame: String,
+    /// The robot's name.
+    pub robot: String,
+    /// Index in the frame.
+    pub index: u32,
+    /// Stamps of its first and last keyframe, s.
+    pub stamps_secs: [f64; 2],
+    /// The anchor's pose in its own frame by odometry alone.
+    pub t_frame_anchor: PoseView,
+    /// The anchor's pose in our own frame by the joint estimate, if connected.
+    pub t_own_anchor: Option<RelationView>,
+}
+
+/// `view/graph`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct GraphView {
+    /// Nodes of the joint estimate.
+    pub nodes: u64,
+    /// χ² at the optimum and its degrees of freedom.
+    pub chi2: f64,
+    /// Degrees of freedom.
+    pub dof: u64,
+    /// Alignments and sightings, used or not (odometry edges are implied by the submaps).
+    pub edges: Vec<EdgeView>,
+}
+
+/// One alignment or sighting.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EdgeView {
+    /// `alignment` or `sighting`.
+    pub kind: String,
+    /// Target submap, `name/epoch#index`.
+    pub i: String,
+    /// Source submap.
+    pub j: String,
+    /// Its measurement `t_i_j`.
+    pub t_i_j: RelationView,
+    /// Both endpoints agree.
+    pub agreed: bool,
+    /// Weight in the joint estimate, 0 if unused.
+    pub weight: f64,
+    /// Why it is not used, or empty.
+    pub reason: String,
+}
+
+/// `view/stats`: counters since start.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct StatsView {
+    /// Bytes of payload sent, by message kind.
+    pub sent_bytes: BTreeMap<String, u64>,
+    /// Messages sent, by kind.
+    pub sent_messages: BTreeMap<String, u64>,
+    /// Bytes of payload received, by kind.
+    pub received_bytes: BTreeMap<String, u64>,
+    /// Messages received, by kind.
+    pub received_messages: BTreeMap<String, u64>,
+    /// Refused input, by reason.
+    pub rejected: BTreeMap<String, u64>,
+    /// Refused input, by peer (name or id).
+    pub rejected_by_peer: BTreeMap<String, u64>,
+    /// Alignments tried here, found, refused, agreed, disputed; solves.
+    pub work: BTreeMap<String, u64>,
+}
+
+impl From<&Sim3> for PoseView {
+    fn from(t: &Sim3) -> Self {
+        Self { translation: t.translation.into(), rotation: t.rotation.xyzw(), scale: t.scale }
+    }
+}
+
+impl From<&Se3> for PoseView {
+    fn from(t: &Se3) -> Self {
+        Self::from(&Sim3::from_se3(t))
+    }
+}
+
+impl From<&Relative> for RelationView {
+    fn from(r: &Relative) -> Self {
+        match r {
+            Relative::Metric(p) => Self::of(PoseView::from(&p.pose), p.covariance.matrix()),
+            Relative::Similarity(s) => Self::of(PoseView::from(&s.sim), s.covariance.matrix()),
+        }
+    }
+}
+
+impl RelationView {
+    fn of<const N: usize>(pose: PoseView, p: &nalgebra::SMatrix<f64, N, N>) -> Self {
+        let covariance = (0..N).flat_map(|r| (r..N).map(move |c| p[(r, c)])).collect();
+        Self { pose, covariance, sigmas: (0..N).map(|i| p[(i, i)].sqrt()).collect() }
+    }
+}

@@ -1,0 +1,128 @@
+//! Facts in domain form: what an entry's payload means once it has been parsed. Every value here is already checked:
+//! finite, unit norm, positive definite, bounded.
+
+use crate::geometry::{PoseWithCovariance, Relative};
+use crate::ids::{EntryId, Hash, SubmapId};
+use crate::time::Stamp;
+use serde::{Deserialize, Serialize};
+
+/// One signed, immutable piece of knowledge.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Fact {
+    /// A finished stretch of the writer's own trajectory.
+    Submap(SubmapFact),
+    /// One endpoint's alignment of two submaps.
+    Alignment(AlignmentFact),
+    /// The other endpoint's own, independent answer to an alignment.
+    Verdict(VerdictFact),
+    /// A direct measurement of another robot.
+    Sighting(SightingFact),
+}
+
+/// Whether a frame's unit is the metre.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ScaleKind {
+    /// Units are metres (LiDAR, depth, stereo, wheel odometry).
+    #[default]
+    Metric,
+    /// Units are the frame's own (monocular SLAM): alignments live in SIM(3).
+    Unknown,
+}
+
+/// A submap, as its owner states it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SubmapFact {
+    /// Position along the writer's trajectory in this epoch, from 0.
+    pub index: u32,
+    /// Stamps of the first and last keyframe.
+    pub stamps: [Stamp; 2],
+    /// `t_prev_this`: pose of this anchor in the previous submap's anchor. For index 0, `t_frame_this`.
+    pub odometry: PoseWithCovariance,
+    /// Half extents of the cloud about the anchor, in frame units.
+    pub extent: [f32; 3],
+    /// Encoded [`crate::submap::Summary`] (opaque here, bounded by `SUMMARY_LEN_MAX`).
+    pub summary: Vec<u8>,
+    /// Number of keypoints in the blob.
+    pub keypoint_count: u16,
+    /// Address of the keypoint blob.
+    pub blob: Hash,
+    /// Unit of the frame.
+    pub scale: ScaleKind,
+}
+
+/// An alignment of two submaps of different frames (or a loop closure within one), by the endpoint that computed it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AlignmentFact {
+    /// The submap whose anchor frame is the target.
+    pub i: SubmapId,
+    /// The submap that is mapped into `i`.
+    pub j: SubmapId,
+    /// `t_i_j` with the covariance of its local perturbation.
+    pub t_i_j: Relative,
+    /// Estimated noise scale σ̂ of the correspondences, in units of `i`.
+    pub sigma: f32,
+    /// Σ of inlier probabilities.
+    pub support: u16,
+    /// log₁₀ of the number of false alarms.
+    pub log10_nfa: f32,
+    /// Keypoint blobs of `i` and `j` it was computed from.
+    pub blobs: [Hash; 2],
+}
+
+/// The other endpoint's answer to one alignment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VerdictFact {
+    /// The entry that holds the [`AlignmentFact`].
+    pub alignment: EntryId,
+    /// What the other endpoint found on its own. Whether the two agree is computed by every reader (χ², 99.9 %),
+    /// never believed.
+    pub outcome: VerdictOutcome,
+}
+
+/// What an independent alignment of the same pair gave.
+#[derive(Clone, Debug, PartialEq)]
+pub enum VerdictOutcome {
+    /// Its own `t_i_j` (same direction as the alignment's).
+    Measured {
+        /// The independent `t_i_j`.
+        t_i_j: Relative,
+        /// σ̂ of its correspondences.
+        sigma: f32,
+        /// Σ of its inlier probabilities.
+        support: u16,
+    },
+    /// It found none.
+    Refused(RefusalReason),
+}
+
+/// Why no alignment was found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RefusalReason {
+    /// Fewer correspondences than the solver needs.
+    TooFew,
+    /// Nothing better than chance.
+    NoConsensus,
+    /// Two different alignments explain the data about equally well.
+    Ambiguous,
+    /// The geometry leaves a direction undetermined.
+    Degenerate,
+    /// The alignment does not fit the rest of the two submaps.
+    PoorFit,
+    /// A blob was missing or malformed.
+    BadInput,
+}
+
+/// A direct relative measurement of another robot (marker, UWB with bearing), carried to anchors by the observer.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SightingFact {
+    /// When, on the observer's clock.
+    pub stamp: Stamp,
+    /// The observer's submap anchor.
+    pub i: SubmapId,
+    /// The observed robot's submap anchor, as its beacon named it.
+    pub j: SubmapId,
+    /// `t_i_j`.
+    pub t_i_j: PoseWithCovariance,
+}
