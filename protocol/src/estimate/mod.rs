@@ -1,1 +1,5 @@
 //! estimate
+
+pub mod frames;
+pub mod residual;
+pub mod trajectory;
