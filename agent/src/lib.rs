@@ -3,6 +3,9 @@
 
 pub mod config;
 pub mod demo;
+pub mod journal;
+pub mod observation;
 pub mod picture;
 pub mod recording;
+pub mod store;
 pub mod trust;
