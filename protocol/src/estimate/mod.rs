@@ -1,13 +1,23 @@
 //! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
 
-pub mod frames;
 pub mod graph;
+mod intake;
+pub mod joint;
+mod loops;
 pub mod marginals;
-pub mod residual;
+mod pairs;
+mod reweight;
+mod similarity;
 pub mod solve;
 mod sparse;
-pub mod trajectory;
 
+pub use intake::Kind as EdgeKind;
+pub use joint::{
+    AgreedAlignment, EdgeEstimate, FrameChain, JointEstimate, MapProblem, PairEstimate, Unused, solve_map,
+};
+
+#[cfg(test)]
+mod joint_tests;
 #[cfg(test)]
 mod solve_tests;
 #[cfg(test)]
