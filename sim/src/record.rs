@@ -1,0 +1,152 @@
+//! Writing the demo's recordings: what each robot of a scenario drives and sees, in the format of
+//! `merganser_protocol::recording`, with the truth beside it. One seed gives the same bytes on every machine: all noise
+//! is seeded, all floats are printed with a fixed number of digits, and clouds are whole numbers of 2 mm.
+
+use crate::scenario::Scenario;
+use crate::stage::Stage;
+use core::fmt::Write as _;
+use merganser_protocol::geometry::{Covariance, Se3};
+use merganser_protocol::ids::{Name, NameError};
+use merganser_protocol::recording::{
+    CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION, XYZ_I16_UNIT_M,
+};
+use merganser_protocol::submap::CovarianceOf;
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// Stamp of the first keyframe, ns.
+const FIRST_STAMP_NS: i64 = 1_000_000_000;
+
+/// Why a recording could not be written.
+#[derive(Debug, Error)]
+pub enum RecordError {
+    /// A file or folder.
+    #[error("{path}: {source}; choose a folder that can be written")]
+    Io {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The scenario's robots cannot be recorded.
+    #[error(transparent)]
+    Name(#[from] NameError),
+    /// The scenario's drives cannot be made.
+    #[error(transparent)]
+    Stage(#[from] crate::stage::StageError),
+    /// The manifest cannot be written as TOML.
+    #[error(transparent)]
+    Toml(#[from] toml::ser::Error),
+}
+
+/// What was written for one robot.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Recorded {
+    /// The robot's name, also its folder's.
+    pub robot: String,
+    /// Keyframes.
+    pub keyframes: usize,
+    /// Points in all.
+    pub points: usize,
+    /// Bytes in all.
+    pub bytes: u64,
+    /// Metres driven.
+    pub metres: f64,
+    /// Seconds driven.
+    pub secs: f64,
+}
+
+/// Writes one folder per robot of the scenario into `out`.
+///
+/// # Errors
+/// [`RecordError`]; what was written before stays.
+pub fn record(scenario: &Scenario, seed: u64, out: &Path) -> Result<Vec<Recorded>, RecordError> {
+    let stage = Stage::new(scenario, seed)?;
+    (0..scenario.robots).map(|robot| record_robot(scenario, &stage, seed, robot, out)).collect()
+}
+
+fn record_robot(
+    scenario: &Scenario,
+    stage: &Stage,
+    seed: u64,
+    robot: usize,
+    out: &Path,
+) -> Result<Recorded, RecordError> {
+    let name = &stage.names()[robot];
+    let folder = out.join(name);
+    let mut done = Recorded { robot: name.clone(), keyframes: 0, points: 0, bytes: 0, metres: 0.0, secs: 0.0 };
+    let mut keyframes = format!("{KEYFRAMES_HEADER}\n");
+    let mut truth = format!("{TRUTH_HEADER}\n");
+    let mut put = |path: PathBuf, bytes: &[u8]| {
+        done.bytes += bytes.len() as u64;
+        write_file(path, bytes)
+    };
+    let steps = stage.steps(robot);
+    for (index, step) in steps.iter().enumerate() {
+        let cloud = format!("clouds/{index:04}.xyz");
+        let points = stage.scan(robot, index);
+        put(folder.join(&cloud), &pack(&points))?;
+        done.points += points.len();
+        let stamp = FIRST_STAMP_NS.saturating_add_unsigned(step.nanos);
+        let odometry = numbers(&pose(&step.t_frame_body), false);
+        let covariance = numbers(&triangle(&step.motion.covariance), true);
+        let _ = writeln!(keyframes, "{stamp},{odometry},{covariance},{cloud}");
+        let _ = writeln!(truth, "{stamp},{}", numbers(&pose(&step.t_world_body), false));
+    }
+    put(folder.join("keyframes.csv"), keyframes.as_bytes())?;
+    put(folder.join("truth.csv"), truth.as_bytes())?;
+    put(folder.join("recording.toml"), manifest(scenario, seed, name, steps.len())?.as_bytes())?;
+    done.keyframes = steps.len();
+    done.metres = scenario.drive.keyframe_m * steps.len().saturating_sub(1) as f64;
+    done.secs = steps.last().map_or(0.0, |step| step.nanos as f64 * 1e-9);
+    Ok(done)
+}
+
+fn manifest(scenario: &Scenario, seed: u64, name: &str, keyframes: usize) -> Result<String, RecordError> {
+    let manifest = Manifest {
+        format: FORMAT.to_owned(),
+        version: VERSION,
+        robot: Name::new(name)?,
+        sensor: "lidar3d".to_owned(),
+        covariance_of: CovarianceOf::Motion,
+        clouds: CloudFormat::XyzI16,
+        keyframes,
+        origin: format!(
+            "made by merganser-sim record, scenario {}, seed {seed}; seeded odometry drift, stated covariance",
+            scenario.name
+        ),
+        config: scenario.config.clone(),
+    };
+    Ok(toml::to_string(&manifest)?)
+}
+
+/// `[x, y, z, qx, qy, qz, qw]`.
+fn pose(t: &Se3) -> Vec<f64> {
+    t.translation.iter().copied().chain(t.rotation.xyzw()).collect()
+}
+
+/// Row-major upper triangle.
+fn triangle(covariance: &Covariance<6>) -> Vec<f64> {
+    let m = covariance.matrix();
+    (0..6).flat_map(|row| (row..6).map(move |column| m[(row, column)])).collect()
+}
+
+fn numbers(values: &[f64], scientific: bool) -> String {
+    // Adding 0.0 turns a negative zero into a plain one.
+    let print = |v: &f64| if scientific { format!("{:.6e}", v + 0.0) } else { format!("{:.9}", v + 0.0) };
+    values.iter().map(print).collect::<Vec<_>>().join(",")
+}
+
+/// Little-endian i16 in units of [`XYZ_I16_UNIT_M`]; the sensor's range keeps it inside i16.
+fn pack(points: &[[f32; 3]]) -> Vec<u8> {
+    let unit = |v: f32| libm::round(f64::from(v) / XYZ_I16_UNIT_M) as i16;
+    points.iter().flatten().flat_map(|&v| unit(v).to_le_bytes()).collect()
+}
+
+fn write_file(path: PathBuf, bytes: &[u8]) -> Result<(), RecordError> {
+    let io = |source| RecordError::Io { path: path.clone(), source };
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder).map_err(io)?;
+    }
+    std::fs::write(&path, bytes).map_err(io)
+}

@@ -1,0 +1,72 @@
+//! The stage of a run: the world, every robot's drive through it, and the scans, all from one scenario and one seed. A
+//! scan is made only when it is asked for, and the same whenever it is.
+
+use crate::dice::Dice;
+use crate::scenario::Scenario;
+use crate::world::World;
+use crate::world::drive::{Step, drive};
+use crate::world::path::Path;
+use crate::world::sensor::Sensor;
+use merganser_protocol::geometry::CovarianceError;
+use thiserror::Error;
+
+/// World, drives and sensor.
+#[derive(Clone, Debug)]
+pub struct Stage {
+    seed: u64,
+    names: Vec<String>,
+    world: World,
+    sensor: Sensor,
+    steps: Vec<Vec<Step>>,
+}
+
+/// Why a stage could not be set.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+pub enum StageError {
+    /// The drift cannot be stated as a covariance.
+    #[error("drive: {0}; choose drift noise between 1e-6 and 10")]
+    Drift(#[from] CovarianceError),
+}
+
+impl Stage {
+    /// Sets the stage.
+    ///
+    /// # Errors
+    /// [`StageError`] if the drift options are out of any covariance's range.
+    pub fn new(scenario: &Scenario, seed: u64) -> Result<Self, StageError> {
+        let options = &scenario.world;
+        let path = |robot: usize| {
+            let mut dice = Dice::new(seed, &format!("path {robot}"));
+            Path::of_robot(robot, options.loop_radius_m, options.loop_spread_m, &mut dice)
+        };
+        let paths: Vec<Path> = (0..scenario.robots).map(path).collect();
+        let world = World::generate(options, &paths, seed);
+        let one = |(robot, path)| {
+            let mut dice = Dice::new(seed, &format!("drive {robot}"));
+            drive(&scenario.drive, path, scenario.duration_secs, &mut dice)
+        };
+        let steps = paths.iter().enumerate().map(one).collect::<Result<_, _>>()?;
+        Ok(Self { seed, names: scenario.names(), world, sensor: Sensor::new(scenario.sensor.clone()), steps })
+    }
+
+    /// The robots' names.
+    pub fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// The world.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+
+    /// One robot's keyframes.
+    pub fn steps(&self, robot: usize) -> &[Step] {
+        &self.steps[robot]
+    }
+
+    /// The points of one keyframe, body frame, m.
+    pub fn scan(&self, robot: usize, index: usize) -> Vec<[f32; 3]> {
+        let mut dice = Dice::new(self.seed, &format!("scan {robot} {index}"));
+        self.sensor.scan(&self.world, &self.steps[robot][index].t_world_body, &mut dice)
+    }
+}
