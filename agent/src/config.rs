@@ -108,6 +108,8 @@ pub struct ZenohConfig {
     pub gossip: bool,
     /// Interface for multicast scouting, or `auto`.
     pub interface: String,
+    /// Interfaces over which `…/in/*` is accepted: this host's loopbacks, unless the SLAM runs on another computer.
+    pub input_interfaces: Vec<String>,
     /// Silence after which a link counts as lost. A partition shorter than this loses no message.
     pub lease_secs: f64,
     /// Largest message accepted from a link.
@@ -125,6 +127,7 @@ impl Default for ZenohConfig {
             multicast: true,
             gossip: true,
             interface: "auto".into(),
+            input_interfaces: vec!["lo".into(), "lo0".into()],
             lease_secs: 10.0,
             message_bytes_max: 1 << 20,
             close_secs: 3.0,
@@ -341,6 +344,10 @@ impl ZenohConfig {
         within("zenoh.message_bytes_max", bytes, low, high, "use 65536 to 16777216 bytes")?;
         within("zenoh.lease_secs", self.lease_secs, 0.5, 600.0, "use 0.5 to 600 s")?;
         within("zenoh.close_secs", self.close_secs, 0.1, 60.0, "use 0.1 to 60 s")?;
+        if self.input_interfaces.is_empty() {
+            let mend = "name at least one interface, e.g. \"lo\"".into();
+            return Err(ValueError { key: "zenoh.input_interfaces".into(), mend });
+        }
         for (key, list) in [("zenoh.listen", &self.listen), ("zenoh.connect", &self.connect)] {
             for text in list {
                 if let Err(error) = text.parse::<zenoh::config::EndPoint>() {

@@ -3,9 +3,13 @@
 
 pub mod config;
 pub mod demo;
+pub mod driver;
 pub mod journal;
+pub mod keys;
+pub mod link;
 pub mod observation;
 pub mod picture;
+pub mod queue;
 pub mod recording;
 pub mod store;
 pub mod trust;
