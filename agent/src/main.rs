@@ -1,1 +1,3 @@
+//! The `merganser` program.
+
 fn main() {}

@@ -1,1 +1,24 @@
-//! estimate
+//! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
+
+pub mod graph;
+mod intake;
+pub mod joint;
+mod loops;
+pub mod marginals;
+mod pairs;
+mod reweight;
+mod similarity;
+pub mod solve;
+mod sparse;
+
+pub use intake::Kind as EdgeKind;
+pub use joint::{
+    AgreedAlignment, EdgeEstimate, FrameChain, JointEstimate, MapProblem, PairEstimate, Unused, solve_map,
+};
+
+#[cfg(test)]
+mod joint_tests;
+#[cfg(test)]
+mod solve_tests;
+#[cfg(test)]
+mod test_graphs;

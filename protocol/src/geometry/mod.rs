@@ -6,11 +6,19 @@
 //! - Perturbations are **local (right)**: `T ⊕ δ = T · exp(δ^)`; a stored covariance is that of δ.
 
 pub mod gaussian;
+pub mod group;
+#[cfg(test)]
+mod laws;
+pub mod relative;
 pub mod se3;
 pub mod sim3;
 pub mod so3;
+#[cfg(test)]
+pub(crate) mod test_support;
 
-pub use gaussian::{Covariance, CovarianceError, PoseWithCovariance, Relative, SimWithCovariance};
+pub use gaussian::{Covariance, CovarianceError, PoseWithCovariance, SimWithCovariance};
+pub use group::Group;
+pub use relative::{Disagreement, Relative};
 pub use se3::Se3;
 pub use sim3::Sim3;
 pub use so3::So3;

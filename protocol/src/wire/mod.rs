@@ -1,4 +1,23 @@
 //! What travels and what is stored: framed, versioned, strictly decoded messages, and facts parsed once into checked
-//! domain types.
+//! domain types. Form is checked here (limits, whole input, canonical bytes, finite values, positive definiteness);
+//! who may say what, and in which order, is the replica's business.
 
+pub mod beacon;
+pub mod entry;
 pub mod fact;
+pub mod frame;
+pub mod have;
+mod json;
+mod lattice;
+pub mod limits;
+pub mod messages;
+pub mod payload;
+pub mod pose;
+
+pub use beacon::{Beacon, BeaconContent};
+pub use entry::{Entry, EntryBytes, EntryContent, EntryError, SwarmTag};
+pub use fact::Fact;
+pub use frame::WireError;
+pub use have::{HaveRoot, HaveVector, Head};
+pub use messages::{AlignStatus, Delta, Message};
+pub use payload::FactError;

@@ -1,0 +1,284 @@
+//! The task that owns the core and keeps its contract: hand it one input, drain its outputs, wait until its timeout or
+//! the next input. Time is what has passed since the process began; heavy jobs run on blocking threads and come back as
+//! inputs; everything that reaches the core is written to the journal first, if there is one.
+
+use crate::journal::{self, Frame, Replayed, StoredInput};
+use crate::queue::{Inbox, Outbox};
+use crate::store;
+use merganser_protocol::agent::Agent;
+use merganser_protocol::agent::io::{AskToken, Channel, Event, Input, JobId, Output, QueryId, QueryKind};
+use merganser_protocol::agent::job::Job;
+use merganser_protocol::ids::{Hash, RobotId};
+use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::time::Instant;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::{Semaphore, mpsc, oneshot};
+use tracing::{debug, error, info, warn};
+
+/// Shortest wait between two timeouts, should the core ask for one that lies in the past.
+const TIMEOUT_STEP: Duration = Duration::from_millis(1);
+/// Longest time that journal frames stay in memory.
+const JOURNAL_FLUSH: Duration = Duration::from_millis(500);
+/// Requests for snapshots that may wait.
+const VIEWS_WAITING: usize = 16;
+
+/// What the driver drives: the real core, or a stand-in of a test.
+pub trait Core: Send + 'static {
+    /// See [`Agent::handle`].
+    fn handle(&mut self, now: Instant, input: Input);
+    /// See [`Agent::poll_output`].
+    fn poll_output(&mut self) -> Option<Output>;
+    /// See [`Agent::poll_timeout`].
+    fn poll_timeout(&self) -> Option<Instant>;
+    /// See [`Agent::digest`].
+    fn digest(&self) -> Hash;
+    /// What the core believes now.
+    fn snapshot(&self, now: Instant) -> Snapshot;
+}
+
+impl Core for Agent {
+    fn handle(&mut self, now: Instant, input: Input) {
+        Self::handle(self, now, input);
+    }
+    fn poll_output(&mut self) -> Option<Output> {
+        Self::poll_output(self)
+    }
+    fn poll_timeout(&self) -> Option<Instant> {
+        Self::poll_timeout(self)
+    }
+    fn digest(&self) -> Hash {
+        Self::digest(self)
+    }
+    fn snapshot(&self, now: Instant) -> Snapshot {
+        let _ = now;
+        todo!("the core makes snapshots soon")
+    }
+}
+
+/// What the core wants sent. Sending never blocks: a network that cannot keep up drops and counts.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Outgoing {
+    /// See [`Output::Publish`].
+    Publish(Channel, Vec<u8>),
+    /// See [`Output::Ask`]; answered through [`Inbox::deliver`] in any case.
+    Ask(QueryId, RobotId, QueryKind, Vec<u8>),
+    /// See [`Output::Answer`].
+    Answer(AskToken, Vec<u8>),
+}
+
+/// The way out: Zenoh, or a stand-in of a test.
+pub trait Network: Send + 'static {
+    /// Sends, or drops and counts. Must not block.
+    fn send(&mut self, outgoing: Outgoing);
+}
+
+/// The clock: monotonic, from an origin at its making.
+#[derive(Clone, Copy, Debug)]
+pub struct Clock(tokio::time::Instant);
+
+impl Clock {
+    /// A clock that shows zero now.
+    pub fn start() -> Self {
+        Self(tokio::time::Instant::now())
+    }
+
+    /// Now.
+    pub fn now(&self) -> Instant {
+        Instant::ZERO.after(self.0.elapsed())
+    }
+
+    async fn reach(&self, moment: Instant) {
+        match self.0.checked_add(moment.since(Instant::ZERO)) {
+            Some(moment) => tokio::time::sleep_until(moment).await,
+            None => std::future::pending().await,
+        }
+    }
+}
+
+/// Asks the driver for snapshots.
+#[derive(Clone, Debug)]
+pub struct Snapshots(mpsc::Sender<oneshot::Sender<Snapshot>>);
+
+impl Snapshots {
+    /// What the core believes now; `None` when the driver has ended.
+    pub async fn take(&self) -> Option<Snapshot> {
+        let (sender, receiver) = oneshot::channel();
+        self.0.send(sender).await.ok()?;
+        receiver.await.ok()
+    }
+}
+
+/// What a driver is made of.
+#[derive(Debug)]
+pub struct Parts<C, N> {
+    /// The core.
+    pub core: C,
+    /// The way out.
+    pub network: N,
+    /// The disk.
+    pub store: store::Writer,
+    /// The journal, its start already written.
+    pub journal: Option<journal::Writer>,
+    /// The queue's receiving end.
+    pub outbox: Outbox,
+    /// The queue's sending end, for results of jobs.
+    pub inbox: Inbox,
+    /// The clock that the core was started with.
+    pub clock: Clock,
+    /// Jobs run at once.
+    pub jobs: usize,
+}
+
+/// What a run came to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Finished {
+    /// The digest of the core's set of facts.
+    pub digest: Hash,
+    /// Inputs handled.
+    pub inputs: u64,
+}
+
+/// See the module.
+#[derive(Debug)]
+pub struct Driver<C, N> {
+    parts: Parts<C, N>,
+    workers: Arc<Semaphore>,
+    views: mpsc::Receiver<oneshot::Sender<Snapshot>>,
+    journal_flushed: Instant,
+    inputs: u64,
+}
+
+impl<C: Core, N: Network> Driver<C, N> {
+    /// A driver, and the way to ask it for snapshots.
+    pub fn new(parts: Parts<C, N>) -> (Self, Snapshots) {
+        let (sender, views) = mpsc::channel(VIEWS_WAITING);
+        let workers = Arc::new(Semaphore::new(parts.jobs.max(1)));
+        (Self { parts, workers, views, journal_flushed: Instant::ZERO, inputs: 0 }, Snapshots(sender))
+    }
+
+    /// Runs until `stop` comes. All batches handed to the store are on disk when it returns.
+    pub async fn run(mut self, stop: impl Future<Output = ()>) -> Finished {
+        let mut stop = std::pin::pin!(stop);
+        let mut after_timeout = false;
+        self.drain();
+        loop {
+            let due = self.due(after_timeout);
+            let clock = self.parts.clock;
+            let input = tokio::select! {
+                biased;
+                () = &mut stop => break,
+                () = clock.reach(due) => Some(Input::Timeout),
+                Some(reply) = self.views.recv() => {
+                    let _ = reply.send(self.parts.core.snapshot(clock.now())); // whoever asked may have gone
+                    None
+                }
+                input = self.parts.outbox.next() => input,
+            };
+            if let Some(input) = input {
+                after_timeout = matches!(input, Input::Timeout);
+                self.handle(input);
+            }
+        }
+        self.finish()
+    }
+
+    /// When to send [`Input::Timeout`]. Right after one, not at once: inputs must have their turn.
+    fn due(&self, after_timeout: bool) -> Instant {
+        let wanted = self.parts.core.poll_timeout().unwrap_or(Instant::MAX);
+        if after_timeout { wanted.max(self.parts.clock.now().after(TIMEOUT_STEP)) } else { wanted }
+    }
+
+    fn handle(&mut self, input: Input) {
+        let now = self.parts.clock.now();
+        let input = if self.parts.journal.is_some() { self.journalled(now, input) } else { Some(input) };
+        if let Some(input) = input {
+            self.inputs += 1;
+            self.parts.core.handle(now, input);
+            self.drain();
+        }
+    }
+
+    fn drain(&mut self) {
+        while let Some(output) = self.parts.core.poll_output() {
+            match output {
+                Output::Persist { batch, records } => self.parts.store.persist(batch, records),
+                Output::Publish { channel, bytes } => self.parts.network.send(Outgoing::Publish(channel, bytes)),
+                Output::Ask { query, peer, kind, bytes } => {
+                    self.parts.network.send(Outgoing::Ask(query, peer, kind, bytes));
+                }
+                Output::Answer { token, bytes } => self.parts.network.send(Outgoing::Answer(token, bytes)),
+                Output::Run { id, job } => self.start(id, job),
+                Output::Event(event) => tell(&event),
+            }
+        }
+    }
+
+    fn start(&self, id: JobId, job: Job) {
+        let (workers, inbox) = (self.workers.clone(), self.parts.inbox.clone());
+        tokio::spawn(async move {
+            let Ok(_permit) = workers.acquire_owned().await else { return };
+            let kind = job.kind();
+            match tokio::task::spawn_blocking(move || job.run()).await {
+                Ok(result) => inbox.deliver(Input::JobDone { job: id, result }),
+                Err(panic) => error!(job = id.0, kind, %panic, "a job panicked; this is a bug, its result is missing"),
+            }
+        });
+    }
+
+    /// Writes the input down and gives back what the replay will see: a keyframe goes through its written form, so that
+    /// both runs handle the same bits.
+    fn journalled(&mut self, now: Instant, input: Input) -> Option<Input> {
+        let stored = StoredInput::from(&input);
+        let input = match (&input, stored.clone().replayed()) {
+            (Input::Keyframe(_), Ok(Replayed::Input(same))) => same,
+            (Input::Keyframe(_), Err(reason)) => {
+                warn!(%reason, "keyframe refused: it cannot be written to the journal");
+                return None;
+            }
+            _ => input,
+        };
+        self.write(&Frame::Input(now, stored));
+        if now.since(self.journal_flushed) >= JOURNAL_FLUSH {
+            self.journal_flushed = now;
+            self.with_journal(journal::Writer::flush);
+        }
+        Some(input)
+    }
+
+    fn finish(mut self) -> Finished {
+        let digest = self.parts.core.digest();
+        self.write(&Frame::End(self.parts.clock.now(), digest));
+        self.with_journal(journal::Writer::flush);
+        Finished { digest, inputs: self.inputs }
+    }
+
+    fn write(&mut self, frame: &Frame) {
+        self.with_journal(|journal| journal.write(frame));
+    }
+
+    fn with_journal(&mut self, work: impl FnOnce(&mut journal::Writer) -> std::io::Result<()>) {
+        if let Some(Err(reason)) = self.parts.journal.as_mut().map(work) {
+            error!(%reason, "the journal ends here: it cannot be written");
+            self.parts.journal = None;
+        }
+    }
+}
+
+/// Logs an event: WARN for what an operator should look into, ERROR for what needs him.
+fn tell(event: &Event) {
+    match event {
+        Event::Rejected { peer, reason, suppressed } => {
+            let peer = peer.map_or("unknown".to_string(), |peer| peer.to_string());
+            warn!(peer, reason, suppressed, "refused input");
+        }
+        Event::ReceiveOnly { reason } => error!(reason, "the store failed: no facts of our own are written any more"),
+        Event::Merged { frame } => info!(%frame, "merged"),
+        Event::Unmerged { frame } => warn!(%frame, "no longer merged"),
+        Event::EpochBegan { frame } => info!(%frame, "a new epoch begins"),
+        Event::SubmapFinished { submap, keypoints } => info!(%submap, keypoints, "submap finished"),
+        Event::AlignmentAgreed { i, j } => info!(%i, %j, "alignment agreed"),
+        Event::AlignmentDisputed { i, j } => warn!(%i, %j, "alignment disputed"),
+        Event::AlignmentProposed { i, j, support } => debug!(%i, %j, support, "alignment proposed"),
+    }
+}

@@ -1,0 +1,138 @@
+//! A Zenoh session as Merganser wants it: explicit endpoints, bounded messages, links that one side alone opens, and an
+//! access list that lets only this host speak on `…/in/*`.
+
+use crate::config::{Mode, ZenohConfig};
+use crate::keys;
+use serde_json::{Value, json};
+use std::time::Duration;
+use thiserror::Error;
+use zenoh::{Config, Session};
+
+/// Longest wait for a session to open.
+const OPEN_TIMEOUT: Duration = Duration::from_secs(15);
+
+/// Why Zenoh does not serve.
+#[derive(Debug, Error)]
+pub enum LinkError {
+    /// A setting is refused.
+    #[error("zenoh refuses {key} = {value}: {reason}")]
+    Setting {
+        /// Zenoh's name of the setting.
+        key: &'static str,
+        /// The value.
+        value: Value,
+        /// What Zenoh said.
+        reason: String,
+    },
+    /// The session does not open.
+    #[error("zenoh does not open ({reason}); is another program listening on {listen:?}?")]
+    Open {
+        /// The endpoints to listen on.
+        listen: Vec<String>,
+        /// What Zenoh said.
+        reason: String,
+    },
+    /// A declaration is refused.
+    #[error("zenoh refuses to serve {key}: {reason}")]
+    Declare {
+        /// The key.
+        key: String,
+        /// What Zenoh said.
+        reason: String,
+    },
+}
+
+/// Opens a session.
+///
+/// # Errors
+/// [`LinkError`].
+pub async fn open(config: &ZenohConfig) -> Result<Session, LinkError> {
+    let refused = |reason| LinkError::Open { listen: config.listen.clone(), reason };
+    let settings = settings(config)?;
+    match tokio::time::timeout(OPEN_TIMEOUT, zenoh::open(settings)).await {
+        Ok(session) => session.map_err(|error| refused(error.to_string())),
+        Err(_) => Err(refused(format!("no answer in {} s", OPEN_TIMEOUT.as_secs()))),
+    }
+}
+
+/// Closes a session, but waits no longer than `wait`: with many links Zenoh takes its time.
+pub async fn close(session: &Session, wait: Duration) {
+    match tokio::time::timeout(wait, session.close()).await {
+        Ok(Ok(())) => {}
+        Ok(Err(reason)) => tracing::warn!(%reason, "zenoh did not close in order"),
+        Err(_) => tracing::warn!(?wait, "zenoh did not close in time"),
+    }
+}
+
+fn settings(config: &ZenohConfig) -> Result<Config, LinkError> {
+    let mut settings = Config::default();
+    for (key, value) in [
+        ("mode", json!(config.mode.as_str())),
+        ("listen/endpoints", json!(if config.mode == Mode::Client { &[] } else { config.listen.as_slice() })),
+        ("connect/endpoints", json!(config.connect)),
+        // A robot that is not there yet must not keep this one from starting.
+        ("connect/timeout_ms", json!({"router": -1, "peer": -1, "client": 10_000})),
+        ("connect/exit_on_failure", json!({"router": false, "peer": false, "client": true})),
+        ("connect/retry", json!({"period_init_ms": 250, "period_max_ms": 4000, "period_increase_factor": 2.0})),
+        ("scouting/multicast/enabled", json!(config.multicast)),
+        ("scouting/multicast/interface", json!(config.interface)),
+        ("scouting/multicast/autoconnect_strategy", one_opens()),
+        ("scouting/gossip/enabled", json!(config.gossip)),
+        ("scouting/gossip/autoconnect_strategy", one_opens()),
+        ("transport/link/tx/lease", json!((config.lease_secs * 1e3) as u64)),
+        ("transport/link/rx/max_message_size", json!(config.message_bytes_max)),
+        ("transport/shared_memory/enabled", json!(false)),
+        ("access_control", access(&config.input_interfaces)),
+    ] {
+        settings.insert_json5(key, &value.to_string()).map_err(|error| LinkError::Setting {
+            key,
+            value,
+            reason: error.to_string(),
+        })?;
+    }
+    Ok(settings)
+}
+
+/// Of two robots that find each other, one opens the link: with two links per pair, healthy neighbours of a lost robot
+/// were measured to freeze for seconds.
+fn one_opens() -> Value {
+    json!({"router": {"to_router": "greater-zid", "to_peer": "greater-zid"},
+           "peer": {"to_router": "always", "to_peer": "greater-zid"}})
+}
+
+/// Everything may be asked, declared and sent. What may come in as a publication is what [`keys`] knows, and `…/in/*`
+/// only over `interfaces`, which are this host's loopbacks. Zenoh looks at the interface of the last link: a neighbour
+/// that runs on this host and relays for others is trusted with what it relays.
+fn access(interfaces: &[String]) -> Value {
+    let table = keys::CHANNELS.iter().map(|channel| keys::channel(*channel).to_string()).chain(["view/*".into()]);
+    let broadcast: Vec<String> = table.map(|rest| format!("{}/*/*/{rest}", keys::PREFIX)).collect();
+    let anyone = json!({"id": "anyone"});
+    let host = json!({"id": "this host", "interfaces": interfaces});
+    let everything = json!(["**"]);
+    let asking = json!([
+        "query",
+        "reply",
+        "declare_subscriber",
+        "declare_queryable",
+        "liveliness_token",
+        "liveliness_query",
+        "declare_liveliness_subscriber"
+    ]);
+    let rule = |id: &str, messages: Value, flows: Value, key_exprs: &Value| json!({"id": id, "permission": "allow", "messages": messages, "flows": flows, "key_exprs": key_exprs});
+    let publications = || json!(["put", "delete"]);
+    json!({
+        "enabled": true,
+        "default_permission": "deny",
+        "rules": [
+            rule("ask and declare", asking, json!(["ingress", "egress"]), &everything),
+            rule("send", publications(), json!(["egress"]), &everything),
+            rule("hear broadcasts", publications(), json!(["ingress"]), &json!(broadcast)),
+            rule("hear this host", publications(), json!(["ingress"]), &everything),
+        ],
+        "subjects": [anyone, host],
+        "policies": [
+            {"rules": ["ask and declare", "send", "hear broadcasts"], "subjects": ["anyone"]},
+            {"rules": ["hear this host"], "subjects": ["this host"]},
+        ],
+    })
+}

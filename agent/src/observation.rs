@@ -1,0 +1,283 @@
+//! What a robot's own SLAM sends to its agent, as it travels: a keyframe or a sighting, in JSON or postcard, told by the
+//! sample's encoding. Decoding is strict (the whole input, known fields only, bounded, finite, positive definite) and
+//! gives domain values, or one clear error.
+//!
+//! ```json
+//! {"stamp_ns": 1700000000000000000, "translation": [0, 0, 0], "rotation": [0, 0, 0, 1],
+//!  "covariance": [1e-4, 0, 0, 0, 0, 0,  1e-4, 0, 0, 0, 0,  1e-4, 0, 0, 0,  1e-6, 0, 0,  1e-6, 0,  1e-6],
+//!  "covariance_of": "motion", "points": [[1.5, 0.2, 0.0]]}
+//! ```
+
+use merganser_protocol::agent::io::Sighting;
+use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, So3};
+use merganser_protocol::ids::Name;
+use merganser_protocol::submap::{CovarianceOf, Keyframe};
+use merganser_protocol::time::Stamp;
+use nalgebra::{Matrix6, Vector3};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Points in one keyframe at most.
+pub const POINTS_MAX: usize = 400_000;
+/// Largest coordinate accepted, in frame units.
+pub const COORDINATE_MAX: f64 = 1e7;
+
+/// A keyframe as it travels.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KeyframeMessage {
+    /// When, in nanoseconds on the robot's clock.
+    pub stamp_ns: i64,
+    /// Translation of `t_frame_body`.
+    pub translation: [f64; 3],
+    /// Quaternion `[x, y, z, w]` of `t_frame_body`; normalised on arrival.
+    pub rotation: [f64; 4],
+    /// Upper triangle, row by row, of the 6×6 covariance of the local perturbation (ρ, φ).
+    pub covariance: [f64; 21],
+    /// What the covariance describes.
+    #[serde(default)]
+    pub covariance_of: CovarianceOf,
+    /// Points in the body frame.
+    pub points: Vec<[f32; 3]>,
+}
+
+/// A sighting as it travels.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SightingMessage {
+    /// When, in nanoseconds on the observer's clock.
+    pub stamp_ns: i64,
+    /// Who was seen.
+    pub robot: Name,
+    /// Translation of `t_body_other`.
+    pub translation: [f64; 3],
+    /// Quaternion `[x, y, z, w]` of `t_body_other`.
+    pub rotation: [f64; 4],
+    /// Upper triangle, row by row, of the 6×6 covariance of the local perturbation (ρ, φ).
+    pub covariance: [f64; 21],
+}
+
+/// How a message is encoded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// `application/json`.
+    Json,
+    /// `application/octet-stream`.
+    Postcard,
+}
+
+/// Why a message is refused.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum ObservationError {
+    /// Not the JSON wanted.
+    #[error("JSON: {0}")]
+    Json(String),
+    /// Not the postcard wanted.
+    #[error("postcard: {0}; the fields are those of the JSON form, in its order")]
+    Postcard(String),
+    /// Bytes after the end.
+    #[error("{0} bytes follow the message")]
+    Trailing(usize),
+    /// A number is NaN, infinite or absurd.
+    #[error("{0} holds a number that is not finite or beyond {COORDINATE_MAX:e}")]
+    Number(&'static str),
+    /// The rotation is no rotation.
+    #[error("rotation: a quaternion [x, y, z, w] cannot be zero")]
+    Rotation,
+    /// The covariance is none.
+    #[error("{0}")]
+    Covariance(#[from] CovarianceError),
+    /// Too many points.
+    #[error("{0} points; send at most {POINTS_MAX}, thinned if need be")]
+    Points(usize),
+}
+
+/// Decodes and checks a keyframe.
+///
+/// # Errors
+/// [`ObservationError`].
+pub fn keyframe(format: Format, bytes: &[u8]) -> Result<Keyframe, ObservationError> {
+    Keyframe::try_from(decode::<KeyframeMessage>(format, bytes)?)
+}
+
+/// Decodes and checks a sighting.
+///
+/// # Errors
+/// [`ObservationError`].
+pub fn sighting(format: Format, bytes: &[u8]) -> Result<Sighting, ObservationError> {
+    Sighting::try_from(decode::<SightingMessage>(format, bytes)?)
+}
+
+fn decode<T: DeserializeOwned>(format: Format, bytes: &[u8]) -> Result<T, ObservationError> {
+    match format {
+        Format::Json => serde_json::from_slice(bytes).map_err(|e| ObservationError::Json(e.to_string())),
+        Format::Postcard => match postcard::take_from_bytes(bytes) {
+            Ok((value, [])) => Ok(value),
+            Ok((_, rest)) => Err(ObservationError::Trailing(rest.len())),
+            Err(e) => Err(ObservationError::Postcard(e.to_string())),
+        },
+    }
+}
+
+impl TryFrom<KeyframeMessage> for Keyframe {
+    type Error = ObservationError;
+    fn try_from(message: KeyframeMessage) -> Result<Self, ObservationError> {
+        let pose = pose(&message.translation, message.rotation, &message.covariance)?;
+        if message.points.len() > POINTS_MAX {
+            return Err(ObservationError::Points(message.points.len()));
+        }
+        if !message.points.iter().flatten().all(|&x| sane(f64::from(x))) {
+            return Err(ObservationError::Number("points"));
+        }
+        let stamp = Stamp(message.stamp_ns);
+        Ok(Self { stamp, pose, covariance_of: message.covariance_of, points: message.points })
+    }
+}
+
+impl From<&Keyframe> for KeyframeMessage {
+    fn from(keyframe: &Keyframe) -> Self {
+        let covariance = keyframe.pose.covariance.matrix();
+        Self {
+            stamp_ns: keyframe.stamp.0,
+            translation: keyframe.pose.pose.translation.into(),
+            rotation: keyframe.pose.pose.rotation.xyzw(),
+            covariance: upper_triangle(covariance),
+            covariance_of: keyframe.covariance_of,
+            points: keyframe.points.clone(),
+        }
+    }
+}
+
+impl TryFrom<SightingMessage> for Sighting {
+    type Error = ObservationError;
+    fn try_from(message: SightingMessage) -> Result<Self, ObservationError> {
+        let checked = pose(&message.translation, message.rotation, &message.covariance)?;
+        let ([x, y, z], [i, j, k, w]) = (message.translation, checked.pose.rotation.xyzw());
+        Ok(Self {
+            stamp: Stamp(message.stamp_ns),
+            robot: message.robot,
+            t_body_other: [x, y, z, i, j, k, w],
+            covariance: upper_triangle(checked.covariance.matrix()),
+        })
+    }
+}
+
+fn pose(
+    translation: &[f64; 3],
+    rotation: [f64; 4],
+    covariance: &[f64; 21],
+) -> Result<PoseWithCovariance, ObservationError> {
+    if !translation.iter().all(|&x| sane(x)) {
+        return Err(ObservationError::Number("translation"));
+    }
+    let rotation = So3::from_xyzw(rotation).ok_or(ObservationError::Rotation)?;
+    let covariance = Covariance::new(symmetric(covariance))?;
+    Ok(PoseWithCovariance { pose: Se3::new(rotation, Vector3::from(*translation)), covariance })
+}
+
+fn sane(x: f64) -> bool {
+    x.abs() <= COORDINATE_MAX // false for NaN
+}
+
+fn symmetric(upper: &[f64; 21]) -> Matrix6<f64> {
+    let mut m = Matrix6::zeros();
+    let places = (0..6).flat_map(|r| (r..6).map(move |c| (r, c)));
+    for ((r, c), value) in places.zip(upper) {
+        m[(r, c)] = *value;
+        m[(c, r)] = *value;
+    }
+    m
+}
+
+fn upper_triangle(m: &Matrix6<f64>) -> [f64; 21] {
+    let mut upper = [0.0; 21];
+    let places = (0..6).flat_map(|r| (r..6).map(move |c| (r, c)));
+    for (value, (r, c)) in upper.iter_mut().zip(places) {
+        *value = m[(r, c)];
+    }
+    upper
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message() -> KeyframeMessage {
+        let mut covariance = [0.0; 21];
+        for (i, start) in [0, 6, 11, 15, 18, 20].into_iter().enumerate() {
+            covariance[start] = 1e-4 * (i + 1) as f64;
+        }
+        KeyframeMessage {
+            stamp_ns: -5,
+            translation: [1.0, 2.0, 3.0],
+            rotation: [0.1, 0.2, 0.3, 0.9],
+            covariance,
+            covariance_of: CovarianceOf::Pose,
+            points: vec![[1.0, 2.0, 3.0], [-1.0, 0.5, 0.25]],
+        }
+    }
+
+    #[test]
+    fn json_and_postcard_say_the_same() {
+        let json = serde_json::to_vec(&message()).unwrap();
+        let postcard = postcard::to_stdvec(&message()).unwrap();
+        let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+        assert_eq!(a, b);
+        assert_eq!((a.stamp, a.covariance_of, a.points.len()), (Stamp(-5), CovarianceOf::Pose, 2));
+    }
+
+    #[test]
+    fn the_documented_json_is_a_keyframe() {
+        let text: String = include_str!("observation.rs")
+            .lines()
+            .skip_while(|line| *line != "//! ```json")
+            .skip(1)
+            .take_while(|line| *line != "//! ```")
+            .map(|line| line.trim_start_matches("//!"))
+            .collect();
+        keyframe(Format::Json, text.as_bytes()).unwrap();
+    }
+
+    #[test]
+    fn each_damage_is_refused() {
+        let refused = |change: &dyn Fn(&mut KeyframeMessage)| {
+            let mut bad = message();
+            change(&mut bad);
+            keyframe(Format::Postcard, &postcard::to_stdvec(&bad).unwrap()).unwrap_err()
+        };
+        assert_eq!(refused(&|m| m.translation[1] = f64::NAN), ObservationError::Number("translation"));
+        assert_eq!(refused(&|m| m.translation[1] = 2.0 * COORDINATE_MAX), ObservationError::Number("translation"));
+        assert_eq!(refused(&|m| m.rotation = [0.0; 4]), ObservationError::Rotation);
+        assert_eq!(refused(&|m| m.points[1][2] = f32::INFINITY), ObservationError::Number("points"));
+        assert_eq!(refused(&|m| m.points = vec![[0.0; 3]; POINTS_MAX + 1]), ObservationError::Points(POINTS_MAX + 1));
+        assert!(matches!(refused(&|m| m.covariance[6] = -1.0), ObservationError::Covariance(_)));
+        assert!(matches!(refused(&|m| m.covariance[1] = 1.0), ObservationError::Covariance(_)));
+    }
+
+    #[test]
+    fn decoding_takes_the_whole_input_and_known_fields_alone() {
+        let good = postcard::to_stdvec(&message()).unwrap();
+        for end in 0..good.len() {
+            assert!(keyframe(Format::Postcard, &good[..end]).is_err(), "{end}");
+        }
+        let long = [good, vec![0, 0]].concat();
+        assert_eq!(keyframe(Format::Postcard, &long), Err(ObservationError::Trailing(2)));
+        let mut json = serde_json::to_value(message()).unwrap();
+        json["colour"] = 1.into();
+        assert!(matches!(keyframe(Format::Json, json.to_string().as_bytes()), Err(ObservationError::Json(_))));
+    }
+
+    #[test]
+    fn a_sighting_is_checked_like_a_keyframe() {
+        let m = message();
+        let (translation, rotation, covariance) = (m.translation, m.rotation, m.covariance);
+        let robot = Name::new("beta").unwrap();
+        let good = SightingMessage { stamp_ns: 7, robot, translation, rotation, covariance };
+        let json = serde_json::to_vec(&good).unwrap();
+        let seen = sighting(Format::Json, &json).unwrap();
+        assert_eq!((seen.stamp, seen.covariance), (Stamp(7), covariance));
+        let bad = SightingMessage { rotation: [0.0; 4], ..good };
+        assert_eq!(Sighting::try_from(bad), Err(ObservationError::Rotation));
+    }
+}

@@ -1,0 +1,98 @@
+//! Bad configurations get one clear error each: the file, the line, the key, and what to mend.
+
+use merganser::config::{FileConfig, FileConfigError};
+use merganser::trust::SecretKey;
+use merganser_protocol::ids::Name;
+use std::path::{Path, PathBuf};
+
+const KEY: &str = "ea4a6c63e29c520abef5507b132ec5f9954776aebebe7b92421eea691446d22c"; // of the secret [7; 32]
+
+fn text(robot: &str, key: &str, rest: &str) -> String {
+    format!("swarm = \"demo\"\nrobot = \"{robot}\"\nkey_file = \"alpha.key\"\n[roster]\nalpha = \"{key}\"\n{rest}\n")
+}
+
+fn error(text: &str) -> String {
+    FileConfig::parse(text, Path::new("a.toml")).unwrap_err().to_string()
+}
+
+#[test]
+fn the_test_key_is_a_key() {
+    assert_eq!(SecretKey::from_bytes([7; 32]).public().to_string(), KEY);
+}
+
+#[test]
+fn the_least_configuration_is_enough() {
+    let config = FileConfig::parse(&text("alpha", KEY, ""), Path::new("a.toml")).unwrap();
+    let name = Name::new("alpha").unwrap();
+    let mut wanted = FileConfig::new(Name::new("demo").unwrap(), name.clone(), "alpha.key".into(), [].into());
+    wanted.roster.insert(name, SecretKey::from_bytes([7; 32]).public());
+    assert_eq!(config, wanted);
+}
+
+#[test]
+fn each_mistake_gets_one_error_that_names_its_line() {
+    let cases: &[(String, &[&str])] = &[
+        (text("alpha", KEY, "colour = 1"), &["a.toml:6", "expected a string"]), // [roster] takes any name
+        (text("alpha", KEY, "[store]\ncolour = 1"), &["a.toml:7", "unknown field `colour`", "`path`"]),
+        (format!("colour = 1\n{}", text("alpha", KEY, "")), &["a.toml:1", "unknown field `colour`", "`robot`"]),
+        (text("Alpha", KEY, ""), &["a.toml:2", "\"Alpha\" is not a name"]),
+        (text("beta", KEY, ""), &["a.toml:2", "robot", "\"beta\" is not in [roster]"]),
+        (text("alpha", "zz", ""), &["a.toml:5", "'z' is no hexadecimal digit"]),
+        (text("alpha", "00", ""), &["a.toml:5", "64 hexadecimal digits"]),
+        (text("alpha", &"00".repeat(32), ""), &["a.toml:5", "no ed25519 public key"]),
+        (text("alpha", KEY, &format!("beta = \"{KEY}\"")), &["a.toml:6", "roster.beta", "same key as alpha"]),
+        (text("alpha", KEY, "Ä = \"00\""), &["a.toml:6"]),
+        (text("alpha", KEY, "[zenoh]\nlease_secs = nan"), &["a.toml:7", "zenoh.lease_secs", "0.5 to 600 s"]),
+        (text("alpha", KEY, "[zenoh]\nconnect = [\"7447\"]"), &["a.toml:7", "zenoh.connect", "no endpoint"]),
+        (text("alpha", KEY, "[zenoh]\nmode = \"mesh\""), &["a.toml:7", "`mesh`", "`peer`"]),
+        (
+            text("alpha", KEY, "[core.submap]\n\nvoxel_m = -1"),
+            &["a.toml:8", "core.submap.voxel_m", "-1", "0.001 to 10 m"],
+        ),
+        (text("alpha", KEY, "[driver]\nqueue = -3"), &["a.toml:7"]),
+        (text("alpha", KEY, "[log]\nfilter = \"a=b=c\""), &["a.toml:7", "log.filter"]),
+        ("swarm = ".into(), &["a.toml:1"]),
+        ("swarm = \"demo\"".into(), &["a.toml", "missing field"]),
+    ];
+    for (text, wanted) in cases {
+        let said = error(text);
+        assert!(wanted.iter().all(|part| said.contains(part)), "{said}\nwanted {wanted:?} from\n{text}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+    }
+}
+
+#[test]
+fn what_is_saved_is_what_is_loaded_with_paths_relative_to_the_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = FileConfig::parse(&text("alpha", KEY, ""), Path::new("a.toml")).unwrap();
+    config.store.path = "/absolute/store.redb".into();
+    config.core.submap.voxel_m = 0.25;
+    config.save(&dir.path().join("a.toml")).unwrap();
+    let loaded = FileConfig::load(&dir.path().join("a.toml")).unwrap();
+    assert_eq!(loaded.key_file, dir.path().join("alpha.key"));
+    assert_eq!(loaded.store.path, PathBuf::from("/absolute/store.redb"));
+    assert_eq!(FileConfig { key_file: "alpha.key".into(), ..loaded }, config);
+}
+
+#[test]
+fn the_key_file_must_exist_and_match_the_roster() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.toml");
+    std::fs::write(&path, text("alpha", KEY, "")).unwrap();
+    let config = FileConfig::load(&path).unwrap();
+    assert!(matches!(config.identity(), Err(FileConfigError::Trust(_))));
+    SecretKey::from_bytes([8; 32]).save(&config.key_file).unwrap();
+    assert!(config.identity().err().unwrap().to_string().contains("[roster] has another for alpha"));
+    std::fs::remove_file(&config.key_file).unwrap();
+    SecretKey::from_bytes([7; 32]).save(&config.key_file).unwrap();
+    assert_eq!(config.identity().unwrap().secret_key, [7; 32]);
+}
+
+#[test]
+fn a_missing_or_huge_file_is_told_by_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.toml");
+    assert!(FileConfig::load(&path).unwrap_err().to_string().contains("a.toml"));
+    std::fs::write(&path, vec![b'#'; (1 << 20) + 1]).unwrap();
+    assert!(FileConfig::load(&path).unwrap_err().to_string().contains("larger than"));
+}

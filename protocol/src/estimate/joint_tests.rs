@@ -1,0 +1,419 @@
+//! The whole map: truth, calibration, order, false alignments, and hostile sets of facts.
+
+use super::joint::*;
+use super::test_graphs::*;
+use crate::config::EstimateConfig;
+use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
+use crate::ids::{EntryId, FrameId, SubmapId};
+use crate::snapshot::PairStatus;
+use crate::wire::fact::ScaleKind;
+use nalgebra::Vector3;
+use rand::RngExt;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use std::collections::BTreeMap;
+
+const ODOMETRY: (f64, f64) = (0.03, 0.008);
+const ALIGNMENT: (f64, f64) = (0.04, 0.01);
+
+/// Robots that drive through one place: the truth, and what they would state.
+struct World {
+    /// `t_world_anchor`, in metres.
+    truth: BTreeMap<SubmapId, Se3>,
+    /// `t_world_frame`; its scale is metres per unit of the frame.
+    frames: BTreeMap<FrameId, Sim3>,
+    problem: MapProblem,
+    next: u32,
+}
+
+impl World {
+    fn new(rng: &mut ChaCha8Rng, robots: u8, anchors: usize, exact: bool) -> Self {
+        Self::scaled(rng, &vec![None; usize::from(robots)], anchors, exact)
+    }
+
+    /// A frame of unknown unit for each `Some(metres per unit)`.
+    fn scaled(rng: &mut ChaCha8Rng, scales: &[Option<f64>], anchors: usize, exact: bool) -> Self {
+        let (truth, frames, problem) = (BTreeMap::new(), BTreeMap::new(), MapProblem::default());
+        let mut world = Self { truth, frames, problem, next: 0 };
+        for (robot, scale) in (0..).zip(scales) {
+            let unit = scale.unwrap_or(1.0);
+            let origin = any_pose(rng, 10.0);
+            let t_world_frame = Sim3::new(origin.rotation, origin.translation, unit);
+            let mut pose = origin;
+            let mut odometry = Vec::new();
+            for index in 0..anchors {
+                let step = any_step(rng);
+                pose = pose * step;
+                let own = Se3::new(step.rotation, step.translation / unit);
+                let covariance = sigmas(ODOMETRY.0 / unit, ODOMETRY.1);
+                let stated =
+                    if exact { PoseWithCovariance { pose: own, covariance } } else { measured(rng, &own, covariance) };
+                odometry.push(stated);
+                world.truth.insert(submap(robot, index), pose);
+            }
+            let kind = if scale.is_some() { ScaleKind::Unknown } else { ScaleKind::Metric };
+            world.frames.insert(frame(robot), t_world_frame);
+            world.problem.frames.insert(frame(robot), FrameChain { scale: kind, odometry });
+        }
+        world
+    }
+
+    fn anchor(&self, id: SubmapId) -> Sim3 {
+        let t = self.truth[&id];
+        Sim3::new(t.rotation, t.translation, self.frames[&id.frame].scale)
+    }
+
+    /// The truth of `t_i_j` with noise (none if `rng` is `None`).
+    fn measure(&self, rng: Option<&mut ChaCha8Rng>, i: SubmapId, j: SubmapId) -> Relative {
+        let truth = self.anchor(i).inverse() * self.anchor(j);
+        let unknown = |id: SubmapId| self.problem.frames[&id.frame].scale == ScaleKind::Unknown;
+        if i.frame != j.frame && (unknown(i) || unknown(j)) {
+            let s = self.frames[&j.frame].scale;
+            let sigmas =
+                [ALIGNMENT.0 / s, ALIGNMENT.0 / s, ALIGNMENT.0 / s, ALIGNMENT.1, ALIGNMENT.1, ALIGNMENT.1, 0.01];
+            let delta = rng.map_or(nalgebra::SVector::zeros(), |rng| {
+                nalgebra::SVector::<f64, 7>::from_fn(|k, _| sigmas[k] * normal(rng))
+            });
+            let covariance = crate::geometry::Covariance::from_sigmas(sigmas).unwrap();
+            return Relative::Similarity(SimWithCovariance { sim: truth.retract(&delta), covariance });
+        }
+        let covariance = sigmas(ALIGNMENT.0, ALIGNMENT.1);
+        let pose = truth.to_se3();
+        Relative::Metric(rng.map_or(PoseWithCovariance { pose, covariance }, |rng| measured(rng, &pose, covariance)))
+    }
+
+    fn state(&mut self, i: SubmapId, j: SubmapId, t_i_j: Relative) -> EntryId {
+        let entry = EntryId { frame: i.frame, seq: self.next };
+        self.next += 1;
+        self.problem.alignments.push(AgreedAlignment { entry, i, j, t_i_j });
+        entry
+    }
+
+    /// `count` alignments between each pair of frames, of distinct submaps.
+    fn align_all(&mut self, rng: &mut ChaCha8Rng, count: usize, exact: bool) {
+        let frames: Vec<FrameId> = self.frames.keys().copied().collect();
+        for (k, &a) in frames.iter().enumerate() {
+            for &b in &frames[k + 1..] {
+                self.align(rng, a, b, count, exact);
+            }
+        }
+    }
+
+    fn align(&mut self, rng: &mut ChaCha8Rng, a: FrameId, b: FrameId, count: usize, exact: bool) {
+        let anchors = self.problem.frames[&a].odometry.len();
+        for k in 0..count {
+            let (i, j) = (rng.random_range(0..anchors), (rng.random_range(0..anchors / count) * count + k) % anchors);
+            let (i, j) = (SubmapId { frame: a, index: i as u32 }, SubmapId { frame: b, index: j as u32 });
+            let (i, j) = if rng.random() { (i, j) } else { (j, i) };
+            let t = self.measure((!exact).then_some(&mut *rng), i, j);
+            self.state(i, j, t);
+        }
+    }
+
+    fn solve(&self) -> JointEstimate {
+        solve_map(&self.problem, &EstimateConfig::default())
+    }
+
+    fn frame_truth(&self, a: FrameId, b: FrameId) -> Sim3 {
+        self.frames[&a].inverse() * self.frames[&b]
+    }
+}
+
+fn rigid(t: &Relative) -> PoseWithCovariance {
+    *t.metric().expect("a rigid relation")
+}
+
+/// Everything an estimate says, as bits.
+fn bits(map: &JointEstimate) -> Vec<u64> {
+    let mut out = vec![map.chi2.to_bits(), map.dof as u64, map.nodes as u64];
+    let mut push = |t: &Relative| {
+        let s = t.lifted();
+        out.extend(s.sim.translation.iter().copied().chain(s.sim.rotation.xyzw()).map(f64::to_bits));
+        out.extend(s.covariance.matrix().iter().map(|x| x.to_bits()));
+    };
+    for frames in map.components() {
+        map.anchors(frames[0]).iter().for_each(|(_, t)| push(t));
+    }
+    map.pairs().iter().filter_map(|p| p.t_a_b.as_ref()).for_each(&mut push);
+    map.edges().iter().for_each(|e| push(&e.measurement.t_i_j));
+    out.extend(map.edges().iter().flat_map(|e| [e.weight.to_bits(), u64::from(e.measurement.entry.seq)]));
+    out
+}
+
+#[test]
+fn noiseless_facts_give_back_the_truth() {
+    for seed in 0..10 {
+        let rng = &mut rng(seed);
+        let mut world = World::new(rng, 4, 10, true);
+        world.align_all(rng, 4, true);
+        let map = world.solve();
+        assert!(map.converged && map.chi2 < 1e-12 && map.components().len() == 1, "seed {seed}: {}", map.chi2);
+        for a in 0..4 {
+            for b in 0..4 {
+                let error = map.frame(frame(a), frame(b)).unwrap().sim().local(&world.frame_truth(frame(a), frame(b)));
+                assert!(error.norm() < 1e-7, "seed {seed}: {error}");
+            }
+            for (id, t) in map.anchors(frame(a)) {
+                let want = world.frames[&frame(a)].inverse() * world.anchor(id);
+                assert!(t.sim().local(&want).norm() < 1e-7);
+                assert!(map.anchor(frame(a), id).unwrap().sim().local(&want).norm() < 1e-7);
+            }
+        }
+    }
+}
+
+#[test]
+fn anees_of_frames_and_anchors_lies_in_the_band() {
+    let (runs, mut of_frames, mut of_anchors, mut merged, mut dropped) = (200, Vec::new(), Vec::new(), 0, 0);
+    for seed in 0..runs {
+        let rng = &mut rng(50_000 + seed);
+        let mut world = World::new(rng, 3, 20, false);
+        world.align_all(rng, 4, false);
+        let map = world.solve();
+        merged += map.pairs().iter().filter(|p| p.status == PairStatus::Merged).count();
+        dropped += map.edges().iter().filter(|e| !e.is_used()).count();
+        for (a, b) in [(0, 1), (0, 2), (1, 2)] {
+            let Some(t) = map.frame(frame(a), frame(b)) else { continue };
+            let t = rigid(&t);
+            let truth = world.frame_truth(frame(a), frame(b)).to_se3();
+            of_frames.push(t.covariance.mahalanobis_squared(&t.pose.local(&truth)));
+        }
+        for (id, t) in map.anchors(frame(0)) {
+            let t = rigid(&t);
+            let truth = (world.frames[&frame(0)].inverse() * world.anchor(id)).to_se3();
+            of_anchors.push(t.covariance.mahalanobis_squared(&t.pose.local(&truth)));
+        }
+    }
+    let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64 / 6.0;
+    let inside = |v: &[f64]| v.iter().filter(|&&x| x < 12.591_587).count() as f64 / v.len() as f64;
+    eprintln!(
+        "{runs} runs: pairs merged {merged}/{}, edges unused {dropped}; ANEES/6 frames {:.3} (95 %: {:.3}), anchors {:.3} (95 %: {:.3})",
+        3 * runs,
+        mean(&of_frames),
+        inside(&of_frames),
+        mean(&of_anchors),
+        inside(&of_anchors)
+    );
+    assert!(merged as f64 > 0.97 * 3.0 * runs as f64, "{merged}");
+    assert!((0.9..=1.1).contains(&mean(&of_frames)) && (0.92..=0.98).contains(&inside(&of_frames)));
+    assert!((0.9..=1.1).contains(&mean(&of_anchors)) && (0.92..=0.98).contains(&inside(&of_anchors)));
+}
+
+#[test]
+fn any_order_of_facts_gives_the_same_bits() {
+    let rng = &mut rng(3);
+    let mut world = World::new(rng, 4, 12, false);
+    world.align_all(rng, 5, false);
+    let lie = Relative::Metric(measured(rng, &any_pose(&mut super::test_graphs::rng(9), 10.0), sigmas(0.04, 0.01)));
+    world.state(submap(0, 3), submap(1, 4), lie);
+    let copy = world.problem.alignments[2];
+    let want = bits(&world.solve());
+    for seed in 0..10 {
+        let mut problem = world.problem.clone();
+        problem.alignments.push(copy);
+        problem.alignments.shuffle(&mut super::test_graphs::rng(seed));
+        let map = solve_map(&problem, &EstimateConfig::default());
+        let repeats = map.edges().iter().filter(|e| e.unused == Some(Unused::RepeatsEntry)).count();
+        assert_eq!(repeats, 1);
+        assert_eq!(map.chi2.to_bits(), want[0]);
+        problem.alignments.retain({
+            let mut seen = std::collections::BTreeSet::new();
+            move |m| seen.insert(m.entry)
+        });
+        assert_eq!(bits(&solve_map(&problem, &EstimateConfig::default())), want, "order {seed}");
+    }
+}
+
+#[test]
+fn one_false_alignment_among_five_is_dropped() {
+    for seed in 0..40 {
+        let rng = &mut rng(700 + seed);
+        let mut world = World::new(rng, 3, 15, false);
+        world.align_all(rng, 4, false);
+        let (i, j) = (submap(0, 7), submap(1, 8));
+        let off = Se3::new(Se3::identity().rotation, Vector3::new(1.5, -1.0, 0.3));
+        let truth = rigid(&world.measure(None, i, j));
+        let lie = PoseWithCovariance { pose: truth.pose * off, ..truth };
+        let entry = world.state(i, j, Relative::Metric(lie));
+        let map = world.solve();
+        let edge = map.edges().iter().find(|e| e.measurement.entry == entry).unwrap();
+        assert!(!edge.is_used() && edge.weight == 0.0, "seed {seed}: {edge:?}");
+        let error = map.frame(frame(0), frame(1)).unwrap().sim().local(&world.frame_truth(frame(0), frame(1)));
+        let sigma = rigid(&map.frame(frame(0), frame(1)).unwrap()).covariance.sigmas();
+        assert!((0..6).all(|k| error[k].abs() < 5.0 * sigma[k]), "seed {seed}: {error}");
+    }
+}
+
+#[test]
+fn a_false_merge_is_caught_by_a_loop_of_frames() {
+    let mut left_out = 0;
+    for seed in 0..20 {
+        let rng = &mut rng(900 + seed);
+        let mut world = World::new(rng, 3, 15, false);
+        world.align(rng, frame(0), frame(1), 5, false);
+        world.align(rng, frame(1), frame(2), 5, false);
+        // Mutually consistent, and wrong by metres.
+        let displaced = Se3::new(Se3::identity().rotation, Vector3::new(3.0, 4.0, 0.0));
+        for k in 0..3 {
+            let (i, j) = (submap(0, 5 * k), submap(2, 4 * k + 1));
+            let t_0_i = world.frames[&frame(0)].to_se3().inverse() * world.truth[&i];
+            let t_0_j = displaced * world.frames[&frame(0)].to_se3().inverse() * world.truth[&j];
+            let t = measured(rng, &(t_0_i.inverse() * t_0_j), sigmas(ALIGNMENT.0, ALIGNMENT.1));
+            world.state(i, j, Relative::Metric(t));
+        }
+        let map = world.solve();
+        let pair = map.pairs().iter().find(|p| (p.a, p.b) == (frame(0), frame(2))).unwrap();
+        assert_eq!(pair.status, PairStatus::Inconsistent, "seed {seed}");
+        assert_eq!(pair.used, 0);
+        left_out += usize::from(pair.contradicts_loop);
+        let t = rigid(&map.frame(frame(0), frame(2)).unwrap());
+        let d = t.covariance.mahalanobis_squared(&t.pose.local(&world.frame_truth(frame(0), frame(2)).to_se3()));
+        assert!(d < 40.0, "seed {seed}: {d}");
+    }
+    assert!(left_out >= 18, "{left_out}");
+}
+
+#[test]
+fn frames_with_too_few_alignments_stay_apart() {
+    let rng = &mut rng(5);
+    let mut world = World::new(rng, 4, 10, false);
+    world.align(rng, frame(0), frame(1), 4, false);
+    world.align(rng, frame(2), frame(3), 2, false);
+    let map = world.solve();
+    assert_eq!(map.components().map(<[_]>::len).collect::<Vec<_>>(), [2, 1, 1]);
+    assert_eq!(map.component_of(frame(0)), map.component_of(frame(1)));
+    assert!(map.frame(frame(2), frame(3)).is_none() && map.relative(submap(0, 0), submap(2, 0)).is_none());
+    let pair = map.pairs().last().unwrap();
+    assert_eq!((pair.status, pair.agreed, pair.used), (PairStatus::Provisional, 2, 0));
+    assert!(map.edges().iter().filter(|e| e.measurement.i.frame >= frame(2)).all(|e| !e.is_used()));
+    assert_eq!(map.nodes, 40);
+    assert_eq!(map.component_of(frame(9)), None);
+}
+
+#[test]
+fn loop_closures_within_a_frame_are_used_and_false_ones_are_not() {
+    let rng = &mut rng(6);
+    let mut world = World::new(rng, 1, 40, false);
+    for k in 0..5 {
+        let (i, j) = (submap(0, k), submap(0, 39 - k));
+        let t = world.measure(Some(rng), i, j);
+        world.state(i, j, t);
+    }
+    let lie = Relative::Metric(PoseWithCovariance { pose: any_pose(rng, 30.0), covariance: sigmas(0.04, 0.01) });
+    let far = world.state(submap(0, 10), submap(0, 20), lie);
+    let truth = rigid(&world.measure(None, submap(0, 5), submap(0, 34)));
+    let off = Se3::new(Se3::identity().rotation, Vector3::new(0.4, 0.4, 0.0));
+    let near = Relative::Metric(PoseWithCovariance { pose: truth.pose * off, ..truth });
+    let near = world.state(submap(0, 5), submap(0, 34), near);
+    let map = world.solve();
+    let reason = |entry| map.edges().iter().find(|e| e.measurement.entry == entry).unwrap().unused;
+    assert!(matches!(reason(far), Some(Unused::Odometry(_))));
+    assert!(matches!(reason(near), Some(Unused::OtherLoops | Unused::Contradicts(_))), "{:?}", reason(near));
+    assert_eq!(map.edges().iter().filter(|e| e.is_used()).count(), 5);
+    let open = solve_map(&MapProblem { alignments: Vec::new(), ..world.problem.clone() }, &EstimateConfig::default());
+    let last = |m: &JointEstimate| rigid(&m.anchor(frame(0), submap(0, 39)).unwrap()).covariance.matrix().trace();
+    assert!(last(&map) < 0.5 * last(&open));
+}
+
+#[test]
+fn sightings_join_merged_frames_only_and_only_if_they_fit() {
+    let rng = &mut rng(8);
+    let mut world = World::new(rng, 3, 10, false);
+    world.align(rng, frame(0), frame(1), 4, false);
+    let mut sight = |world: &mut World, i: SubmapId, j: SubmapId, off: f64| {
+        let t = rigid(&world.measure(Some(rng), i, j));
+        let off = Se3::new(Se3::identity().rotation, Vector3::new(off, 0.0, 0.0));
+        let t_i_j = Relative::Metric(PoseWithCovariance { pose: t.pose * off, ..t });
+        let entry = EntryId { frame: i.frame, seq: 1000 + world.next };
+        world.next += 1;
+        world.problem.sightings.push(AgreedAlignment { entry, i, j, t_i_j });
+        entry
+    };
+    let good = sight(&mut world, submap(0, 2), submap(1, 3), 0.0);
+    let bad = sight(&mut world, submap(0, 4), submap(1, 5), 5.0);
+    let stray = sight(&mut world, submap(0, 4), submap(2, 5), 0.0);
+    let own = sight(&mut world, submap(0, 4), submap(0, 5), 0.0);
+    let map = world.solve();
+    let reason = |entry| map.edges().iter().find(|e| e.measurement.entry == entry).unwrap().unused;
+    assert_eq!(reason(good), None);
+    assert!(matches!(reason(bad), Some(Unused::Contradicts(_))));
+    assert_eq!(reason(stray), Some(Unused::Unmerged(PairStatus::Provisional)));
+    assert_eq!(reason(own), Some(Unused::SameFrame));
+    assert_ne!(map.component_of(frame(0)), map.component_of(frame(2)));
+}
+
+#[test]
+fn a_frame_of_unknown_unit_merges_in_sim3_with_an_honest_covariance() {
+    let (runs, mut of_frames, mut merged) = (600, Vec::new(), 0);
+    for seed in 0..runs {
+        let rng = &mut rng(3000 + seed);
+        let unit = libm::exp(0.7 * normal(rng));
+        // Every second run has no metric frame at all: the first frame's unit is the component's.
+        let first = (seed % 2 == 1).then_some(0.5);
+        let mut world = World::scaled(rng, &[first, Some(unit)], 12, false);
+        world.align_all(rng, 4, false);
+        let map = world.solve();
+        let Some(t) = map.frame(frame(0), frame(1)) else { continue };
+        merged += 1;
+        let Relative::Similarity(t) = t else { panic!("a similarity expected") };
+        let error = t.sim.local(&world.frame_truth(frame(0), frame(1)));
+        of_frames.push(t.covariance.mahalanobis_squared(&error));
+        assert!(map.relative(submap(1, 0), submap(1, 11)).unwrap().metric().is_some());
+    }
+    let anees = of_frames.iter().sum::<f64>() / of_frames.len() as f64 / 7.0;
+    eprintln!("SIM(3): {merged} of {runs} merged, ANEES/7 {anees:.3}");
+    assert!(merged * 100 >= runs * 95);
+    assert!((0.8..=1.2).contains(&anees));
+}
+
+#[test]
+fn hostile_facts_are_listed_and_do_no_harm() {
+    let rng = &mut rng(12);
+    let mut world = World::new(rng, 3, 10, false);
+    world.align_all(rng, 4, false);
+    let want = world.solve();
+    let good = rigid(&world.measure(None, submap(0, 1), submap(1, 1)));
+    let nan = PoseWithCovariance { pose: Se3::new(good.pose.rotation, Vector3::new(f64::NAN, 0.0, 0.0)), ..good };
+    let huge = PoseWithCovariance { pose: Se3::new(good.pose.rotation, Vector3::new(1e300, 0.0, 0.0)), ..good };
+    let sim = SimWithCovariance::from_metric(&good);
+    let cases = [
+        (submap(0, 1), submap(1, 1), Relative::Metric(nan)),
+        (submap(0, 1), submap(1, 99), Relative::Metric(good)),
+        (submap(7, 1), submap(1, 1), Relative::Metric(good)),
+        (submap(0, 1), submap(0, 1), Relative::Metric(good)),
+        (submap(0, 2), submap(1, 9), Relative::Similarity(sim)),
+        (submap(0, 9), submap(1, 0), Relative::Metric(huge)),
+    ];
+    let entries: Vec<EntryId> = cases.into_iter().map(|(i, j, t)| world.state(i, j, t)).collect();
+    let again = world.problem.alignments[0];
+    let [copy, flipped] = [10_000, 10_001].map(|seq| EntryId { frame: frame(2), seq });
+    world.problem.alignments.push(AgreedAlignment { entry: copy, ..again });
+    let turned = AgreedAlignment { entry: flipped, i: again.j, j: again.i, t_i_j: again.t_i_j.inverse() };
+    world.problem.alignments.push(turned);
+    let map = world.solve();
+    let reason = |entry| map.edges().iter().find(|e| e.measurement.entry == entry).unwrap().unused;
+    let reasons: Vec<_> = entries.iter().map(|&e| reason(e)).collect();
+    use Unused::{NotFinite, SelfLoop, Units, UnknownSubmap};
+    assert_eq!(reasons[..5], [Some(NotFinite), Some(UnknownSubmap), Some(UnknownSubmap), Some(SelfLoop), Some(Units)]);
+    assert!(reasons[5].is_some());
+    assert_eq!(reason(copy), Some(Unused::RepeatsPair(again.entry)));
+    assert_eq!(reason(flipped), Some(Unused::RepeatsPair(again.entry)));
+    assert_eq!(map.chi2.to_bits(), want.chi2.to_bits());
+    assert!(map.edges().iter().filter_map(|e| e.unused).all(|u| !u.to_string().is_empty()));
+}
+
+#[test]
+fn a_broken_chain_ends_where_it_breaks() {
+    let rng = &mut rng(13);
+    let mut world = World::new(rng, 2, 10, false);
+    world.align_all(rng, 4, false);
+    let chain = world.problem.frames.get_mut(&frame(1)).unwrap();
+    chain.odometry[6].pose.translation.x = f64::INFINITY;
+    let map = world.solve();
+    assert_eq!(map.nodes, 16);
+    assert!(map.anchor(frame(1), submap(1, 5)).is_some() && map.anchor(frame(1), submap(1, 6)).is_none());
+    world.problem.frames.get_mut(&frame(1)).unwrap().odometry[0].pose.translation.x = f64::NAN;
+    assert_eq!(world.solve().component_of(frame(1)), None);
+    let empty = solve_map(&MapProblem::default(), &EstimateConfig::default());
+    assert!(empty.converged && empty.nodes == 0 && empty.pairs().is_empty());
+}

@@ -1,0 +1,168 @@
+//! Covariances of a solved component: of any anchor relative to any other, cross-correlations kept.
+//!
+//! With `T = X_i⁻¹ X_j` and local perturbations, `δ_T = δ_j − Ad(T⁻¹) δ_i`, so that `Σ_T = A H⁻¹ Aᵀ` for the sparse row
+//! block A of that expression: seven solves per pair. All anchors relative to one take seven solves and one selected
+//! inversion (MATH §3: joint covariances, never sums of marginals).
+
+use super::solve::Solution;
+use crate::geometry::sim3::{Matrix7, Vector7};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
+use crate::ids::{FrameId, SubmapId};
+use nalgebra::Matrix6;
+use std::collections::BTreeSet;
+
+/// Standard deviation stated for relations that are certain by definition (an anchor in itself).
+const SIGMA_CERTAIN: f64 = 1e-9;
+
+impl Solution {
+    /// `t_i_j` between two anchors of the component with the covariance of its local perturbation: rigid, in the
+    /// frames' own unit, within one frame or between metric frames (those not in `unknown_scale`); a similarity
+    /// otherwise. `None` for anchors of other components.
+    pub fn relative(&self, i: SubmapId, j: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Option<Relative> {
+        let (a, b) = (self.graph.position(i)?, self.graph.position(j)?);
+        let t_i_j = self.values[a].inverse() * self.values[b];
+        let rigid = is_rigid(i.frame, j.frame, unknown_scale);
+        if a == b {
+            return Some(Relative::Metric(certain()));
+        }
+        relation(t_i_j, self.covariance_between(a, b)?, rigid)
+    }
+
+    /// [`Solution::relative`] of every anchor to `reference`, in the order of the component's anchors.
+    pub fn relatives_to(&self, reference: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Vec<(SubmapId, Relative)> {
+        let Some(r) = self.graph.position(reference) else { return Vec::new() };
+        let Some(columns) = self.columns_of(&self.row_block(r, &Matrix7::identity())) else { return Vec::new() };
+        let inverse = self.pattern.selected_inverse(&self.factor);
+        let at_reference = self.rows(&columns, r);
+        let anchors = self.graph.nodes().iter().enumerate();
+        let one = |(k, &id): (usize, &SubmapId)| {
+            if k == r {
+                return Some((id, Relative::Metric(certain())));
+            }
+            let t_r_k = self.values[r].inverse() * self.values[k];
+            let variables = self.variables(k);
+            let mut own = Matrix7::zeros();
+            for (p, x) in variables.iter().enumerate() {
+                for (q, y) in variables.iter().enumerate() {
+                    if let (Some(x), Some(y)) = (x, y) {
+                        own[(p, q)] = inverse.get(*x, *y)?;
+                    }
+                }
+            }
+            let a = t_r_k.inverse().adjoint();
+            let cross = self.rows(&columns, k) * a.transpose();
+            let joint = own - cross - cross.transpose() + a * at_reference * a.transpose();
+            let rigid = is_rigid(reference.frame, id.frame, unknown_scale);
+            let direct = || self.relative(reference, id, unknown_scale);
+            Some((id, relation(t_r_k, joint, rigid).or_else(direct)?))
+        };
+        anchors.filter_map(one).collect()
+    }
+
+    /// Covariance of δ in `X_a⁻¹ X_b ⊕ δ`; its scale row is zero where both ends share one scale.
+    pub(super) fn covariance_between(&self, a: usize, b: usize) -> Option<Matrix7> {
+        let t_b_a = self.values[b].inverse() * self.values[a];
+        let rows = self.difference(a, b, &t_b_a.adjoint());
+        let columns = self.columns_of(&rows)?;
+        let mut out = Matrix7::zeros();
+        for (scalar, row) in &rows {
+            for c in 0..7 {
+                let x = columns[c * self.pattern.scalars() + scalar];
+                for r in 0..7 {
+                    out[(r, c)] += row[r] * x;
+                }
+            }
+        }
+        Some((out + out.transpose()) * 0.5)
+    }
+
+    /// The row block A of `δ_b − Ad δ_a` as (scalar, column of A).
+    fn difference(&self, a: usize, b: usize, adjoint: &Matrix7) -> Vec<(usize, Vector7)> {
+        let mut rows = self.row_block(b, &Matrix7::identity());
+        for (scalar, column) in self.row_block(a, &-adjoint) {
+            match rows.iter_mut().find(|(s, _)| *s == scalar) {
+                Some((_, sum)) => *sum += column,
+                None => rows.push((scalar, column)),
+            }
+        }
+        rows
+    }
+
+    /// `m` applied to the perturbation of one anchor, as (scalar, column).
+    fn row_block(&self, node: usize, m: &Matrix7) -> Vec<(usize, Vector7)> {
+        let scalar = |(k, v): (usize, Option<(usize, usize)>)| {
+            v.map(|(variable, offset)| (self.pattern.start(variable) + offset, m.column(k).into_owned()))
+        };
+        self.variables(node).into_iter().enumerate().filter_map(scalar).collect()
+    }
+
+    /// `H⁻¹ Aᵀ`, seven columns.
+    fn columns_of(&self, rows: &[(usize, Vector7)]) -> Option<Vec<f64>> {
+        let n = self.pattern.scalars();
+        let mut columns = vec![0.0; 7 * n];
+        for (scalar, row) in rows {
+            for c in 0..7 {
+                columns[c * n + scalar] = row[c];
+            }
+        }
+        self.pattern.solve(&self.factor, &mut columns, 7).ok()?;
+        Some(columns)
+    }
+
+    /// Rows of `columns` that belong to one anchor.
+    fn rows(&self, columns: &[f64], node: usize) -> Matrix7 {
+        let mut out = Matrix7::zeros();
+        for (r, variable) in self.variables(node).iter().enumerate() {
+            if let Some((variable, offset)) = variable {
+                let scalar = self.pattern.start(*variable) + offset;
+                for c in 0..7 {
+                    out[(r, c)] = columns[c * self.pattern.scalars() + scalar];
+                }
+            }
+        }
+        out
+    }
+
+    /// The (variable, scalar within it) of each tangent direction of an anchor; `None` where it is fixed.
+    fn variables(&self, node: usize) -> [Option<(usize, usize)>; 7] {
+        let mut out = [None; 7];
+        if node > 0 {
+            for (k, slot) in out.iter_mut().take(6).enumerate() {
+                *slot = Some((node - 1, k));
+            }
+        }
+        out[6] = self.graph.scale_of(node).map(|s| (self.graph.nodes().len() - 1 + s, 0));
+        out
+    }
+}
+
+/// The identity, with the smallest covariance that can be stated.
+pub(super) fn certain() -> PoseWithCovariance {
+    let covariance = Covariance::new_or_wider(Matrix6::identity() * (SIGMA_CERTAIN * SIGMA_CERTAIN));
+    PoseWithCovariance { pose: Se3::identity(), covariance }
+}
+
+/// Whether a relation between two frames is rigid.
+pub(super) fn is_rigid(a: FrameId, b: FrameId, unknown_scale: &BTreeSet<FrameId>) -> bool {
+    a == b || !(unknown_scale.contains(&a) || unknown_scale.contains(&b))
+}
+
+fn relation(sim: Sim3, covariance: Matrix7, rigid: bool) -> Option<Relative> {
+    if rigid {
+        let m: Matrix6<f64> = covariance.fixed_view::<6, 6>(0, 0).into_owned();
+        let covariance = Covariance::new(floored(m)).ok()?;
+        Some(Relative::Metric(PoseWithCovariance { pose: sim.to_se3(), covariance }))
+    } else {
+        let covariance = Covariance::new(floored(covariance)).ok()?;
+        Some(Relative::Similarity(SimWithCovariance { sim, covariance }))
+    }
+}
+
+/// Symmetric, and no variance below what can be stated.
+fn floored<const N: usize>(m: nalgebra::SMatrix<f64, N, N>) -> nalgebra::SMatrix<f64, N, N> {
+    let mut out = (m + m.transpose()) * 0.5;
+    for k in 0..N {
+        out[(k, k)] = out[(k, k)].max(SIGMA_CERTAIN * SIGMA_CERTAIN);
+    }
+    out
+}

@@ -1,0 +1,417 @@
+//! All logs together, and the two ways in: [`Replica::append`] for this robot's own facts, [`Replica::ingest`] for
+//! everything that arrives. Checks run from cheap to dear (size, form, swarm, roster, duplicates, limits, signature,
+//! chain), so that a flood of foreign entries costs no signature check and no memory.
+
+use super::fork::ForkProof;
+use super::log::{Held, Link, Log};
+use crate::config::GossipConfig;
+use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
+use crate::wire::{Beacon, Entry, EntryContent, EntryError, Fact, FactError, SwarmTag};
+use ed25519_dalek::{SigningKey, VerifyingKey};
+use std::collections::BTreeMap;
+use thiserror::Error;
+
+/// Entries per robot that wait for a predecessor, over all its frames.
+pub const EARLY_PER_ROBOT_MAX: usize = 64;
+
+/// The facts that one robot holds. See the [module](super) for its rules.
+pub struct Replica {
+    pub(super) swarm: SwarmTag,
+    members: BTreeMap<RobotId, Member>,
+    pub(super) slots: BTreeMap<FrameId, Slot>,
+    entries_per_frame_max: u32,
+    epochs_per_robot_max: usize,
+}
+
+struct Member {
+    name: Name,
+    key: VerifyingKey,
+}
+
+/// A frame's log, or the proof that it has two histories.
+pub(super) enum Slot {
+    Log(Log),
+    Forked(ForkProof),
+}
+
+/// A roster that cannot be used.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum RosterError {
+    /// No ed25519 public key, or a weak one.
+    #[error("the key of {0} is not a usable ed25519 public key; take the line that `keys generate` printed")]
+    Key(Name),
+    /// Two names, one key.
+    #[error("{0} and {1} have the same key; every robot needs its own")]
+    Twice(Name, Name),
+}
+
+/// What became of an entry that was taken in.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ingested {
+    /// New: this entry, then those that had waited for it, in order. All must be made durable.
+    New(Vec<EntryId>),
+    /// Held already; nothing changed.
+    Known,
+    /// Its predecessor is missing: it waits, in bounded memory, neither stored nor advertised.
+    Early(EntryId),
+}
+
+/// Why an entry was refused. No state changed, except by [`IngestError::Fork`].
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum IngestError {
+    /// Not an entry, or not signed by its origin.
+    #[error(transparent)]
+    Entry(#[from] EntryError),
+    /// Of another swarm.
+    #[error("entry belongs to another swarm ({0:?})")]
+    Swarm(SwarmTag),
+    /// Of a robot that is not in the roster.
+    #[error("robot {0} is not in the roster")]
+    UnknownOrigin(RobotId),
+    /// The robot has as many epochs as are held.
+    #[error("robot {0} has more epochs than gossip.epochs_per_robot_max; raise it or retire old ones")]
+    EpochLimit(RobotId),
+    /// The log is as long as is held.
+    #[error("entry {0} is beyond gossip.entries_per_frame_max")]
+    SeqLimit(EntryId),
+    /// The writer's floor falls: the log ends here, on every robot alike.
+    #[error("entry {0} lowers its writer's floor")]
+    FloorFell(EntryId),
+    /// Its predecessor is missing, and so many nearer ones wait already that it was not kept.
+    #[error("entry {0} is too far ahead of what is held")]
+    TooEarly(EntryId),
+    /// The log is quarantined.
+    #[error("log {0} has two histories and is quarantined")]
+    Quarantined(FrameId),
+    /// The log has two histories, as this entry proves: **the log is quarantined now** ([`Replica::forks`] has the
+    /// proof).
+    #[error("log {0} has two histories: the same key is used twice, or a store was restored from an old image")]
+    Fork(FrameId),
+    /// Two entries that do not contradict each other were given as a fork proof.
+    #[error("the two entries do not prove a fork")]
+    NotAProof,
+}
+
+impl IngestError {
+    /// A short name for counters.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Entry(error) => error.reason(),
+            Self::Swarm(_) => "swarm",
+            Self::UnknownOrigin(_) => "unknown_origin",
+            Self::EpochLimit(_) => "epoch_limit",
+            Self::SeqLimit(_) => "seq_limit",
+            Self::FloorFell(_) => "floor_fell",
+            Self::TooEarly(_) => "too_early",
+            Self::Quarantined(_) => "quarantined",
+            Self::Fork(_) => "fork",
+            Self::NotAProof => "not_a_proof",
+        }
+    }
+}
+
+/// Why a fact of our own cannot be written. No state changed.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum AppendError {
+    /// The fact is not writable.
+    #[error(transparent)]
+    Fact(#[from] FactError),
+    /// The entry would be over a limit.
+    #[error(transparent)]
+    Entry(#[from] EntryError),
+    /// The key is no member's.
+    #[error("robot {0} is not in the roster")]
+    NotInRoster(RobotId),
+    /// A later epoch was begun.
+    #[error("epoch {epoch} is closed: epoch {latest} was begun")]
+    Closed {
+        /// The epoch asked for.
+        epoch: u32,
+        /// The latest one.
+        latest: u32,
+    },
+    /// The log is full or quarantined, or others hold entries of it that this robot did not write in this run or load
+    /// from its store. Writing on would tell a second story.
+    #[error("log {0} cannot be continued ({1}); begin a new epoch")]
+    NewEpochNeeded(FrameId, &'static str),
+}
+
+impl Replica {
+    /// An empty replica for the members of `roster` (name and ed25519 public key).
+    ///
+    /// # Errors
+    /// [`RosterError`] if a key is unusable or used twice.
+    pub fn new(
+        swarm: &Name,
+        roster: impl IntoIterator<Item = (Name, [u8; 32])>,
+        limits: &GossipConfig,
+    ) -> Result<Self, RosterError> {
+        let mut members = BTreeMap::<RobotId, Member>::new();
+        for (name, public) in roster {
+            let key = VerifyingKey::from_bytes(&public).ok().filter(|key| !key.is_weak());
+            let key = key.ok_or_else(|| RosterError::Key(name.clone()))?;
+            if let Some(other) = members.insert(RobotId::of_key(&public), Member { name: name.clone(), key }) {
+                return Err(RosterError::Twice(other.name, name));
+            }
+        }
+        Ok(Self {
+            swarm: SwarmTag::of(swarm),
+            members,
+            slots: BTreeMap::new(),
+            entries_per_frame_max: limits.entries_per_frame_max,
+            epochs_per_robot_max: limits.epochs_per_robot_max,
+        })
+    }
+
+    /// Signs a fact as the next entry of this robot's log of `frame_epoch`. It is held at once, but shown to nobody
+    /// until [`Replica::mark_durable`].
+    ///
+    /// # Errors
+    /// [`AppendError`]; no state changes.
+    pub fn append(&mut self, key: &SigningKey, frame_epoch: u32, fact: &Fact) -> Result<Entry, AppendError> {
+        let robot = RobotId::of_key(key.verifying_key().as_bytes());
+        let frame = FrameId { robot, epoch: frame_epoch };
+        if !self.members.contains_key(&robot) {
+            return Err(AppendError::NotInRoster(robot));
+        }
+        if let Some(latest) = self.epochs_of(robot).last().filter(|latest| *latest > frame_epoch) {
+            return Err(AppendError::Closed { epoch: frame_epoch, latest });
+        }
+        let needed = |why| Err(AppendError::NewEpochNeeded(frame, why));
+        let (seq, floor, previous) = match self.slots.get(&frame) {
+            Some(Slot::Forked(_)) => return needed("it has two histories"),
+            Some(Slot::Log(log)) if log.received || !log.early.is_empty() => {
+                return needed("others hold entries of it that this store lost");
+            }
+            Some(Slot::Log(log)) if log.next_seq() >= self.entries_per_frame_max => return needed("it is full"),
+            Some(Slot::Log(log)) => (log.next_seq(), log.floor(), log.head()),
+            None => (0, 0, Hash::default()),
+        };
+        let (kind, payload) = (fact.kind(), fact.to_payload()?);
+        let id = EntryId { frame, seq };
+        let entry = Entry::sign(key, EntryContent { swarm: self.swarm, id, kind, floor, previous, payload })?;
+        self.log_mut(frame).entries.push(Held::new(&entry, &entry.encode()));
+        Ok(entry)
+    }
+
+    /// Takes in an entry from anywhere.
+    ///
+    /// # Errors
+    /// [`IngestError`]; only [`IngestError::Fork`] changes state.
+    pub fn ingest(&mut self, bytes: &[u8]) -> Result<Ingested, IngestError> {
+        let entry = self.admit(bytes)?;
+        let id = entry.id();
+        let frame = id.frame;
+        match self.slots.get(&frame) {
+            Some(Slot::Forked(_)) => return Err(IngestError::Quarantined(frame)),
+            Some(Slot::Log(log)) if log.held(id.seq).is_some_and(|held| *held.bytes == *bytes) => {
+                return Ok(Ingested::Known);
+            }
+            Some(Slot::Log(log)) if log.early.get(&id.seq) == Some(&entry) => return Ok(Ingested::Early(id)),
+            _ => {}
+        }
+        self.check_epoch(frame)?;
+        self.check_seq(id)?;
+        self.verify(&entry)?;
+
+        let next = self.next_seq(frame);
+        if id.seq > next {
+            return self.hold_early(entry, bytes);
+        }
+        if let Some(held) = self.log(frame).and_then(|log| log.held(id.seq)) {
+            let other = held.bytes.to_vec();
+            return Err(self.fork(frame, &other, bytes));
+        }
+        self.push(entry, bytes)?;
+        let mut new = vec![id];
+        while let Some(entry) = self.take_early(frame) {
+            let id = entry.id();
+            match self.push(entry.clone(), &entry.encode()) {
+                Ok(()) => new.push(id),
+                Err(IngestError::Fork(frame)) => return Err(IngestError::Fork(frame)),
+                Err(_) => break,
+            }
+        }
+        Ok(Ingested::New(new))
+    }
+
+    /// The entry `id` is on disk: from now on it may be shown, once all before it are, too. Unknown ids are ignored.
+    pub fn mark_durable(&mut self, id: EntryId) {
+        if let Some(Slot::Log(log)) = self.slots.get_mut(&id.frame) {
+            log.mark_durable(id.seq);
+        }
+    }
+
+    /// The next free place in a log, counting entries that are not durable yet; 0 for logs not held.
+    pub fn next_seq(&self, frame: FrameId) -> u32 {
+        self.log(frame).map_or(0, Log::next_seq)
+    }
+
+    /// Epochs known of a robot, rising.
+    pub fn epochs_of(&self, robot: RobotId) -> impl DoubleEndedIterator<Item = u32> {
+        let all = FrameId { robot, epoch: 0 }..=FrameId { robot, epoch: u32::MAX };
+        self.slots.range(all).map(|(frame, _)| frame.epoch)
+    }
+
+    /// Durable entries in canonical order (frame, then place), as canonical bytes, logs in quarantine left out.
+    pub fn entries(&self) -> impl Iterator<Item = (EntryId, &[u8])> {
+        self.logs().flat_map(|(frame, log)| {
+            let id = move |seq| EntryId { frame, seq };
+            (0..log.durable).zip(log.durable_entries()).map(move |(seq, held)| (id(seq), &*held.bytes))
+        })
+    }
+
+    /// The facts in [`Replica::entries`]. Payloads that are no fact (of newer kinds, or malformed though signed) are
+    /// passed over, on every robot alike.
+    pub fn facts(&self) -> impl Iterator<Item = (EntryId, Fact)> {
+        self.entries().filter_map(|(id, bytes)| Some((id, Entry::decode(bytes).ok()?.fact().ok()?)))
+    }
+
+    /// One entry, durable or not.
+    pub fn entry(&self, id: EntryId) -> Option<Entry> {
+        Entry::decode(self.entry_bytes(id)?).ok()
+    }
+
+    /// One entry's canonical bytes, durable or not.
+    pub fn entry_bytes(&self, id: EntryId) -> Option<&[u8]> {
+        self.log(id.frame)?.held(id.seq).map(|held| &*held.bytes)
+    }
+
+    /// This swarm's tag.
+    pub fn swarm(&self) -> SwarmTag {
+        self.swarm
+    }
+
+    /// A member's name.
+    pub fn name_of(&self, robot: RobotId) -> Option<&Name> {
+        self.members.get(&robot).map(|member| &member.name)
+    }
+
+    /// The members, in the order of their ids.
+    pub fn members(&self) -> impl Iterator<Item = (RobotId, &Name)> {
+        self.members.iter().map(|(robot, member)| (*robot, &member.name))
+    }
+
+    /// Whether a beacon comes from the member it names.
+    #[must_use]
+    pub fn verify_beacon(&self, beacon: &Beacon) -> bool {
+        self.members.get(&beacon.robot()).is_some_and(|member| beacon.verify(&member.key, self.swarm))
+    }
+
+    /// The cheap checks: size, form, swarm, roster.
+    pub(super) fn admit(&self, bytes: &[u8]) -> Result<Entry, IngestError> {
+        let entry = Entry::decode(bytes)?;
+        if entry.swarm() != self.swarm {
+            return Err(IngestError::Swarm(entry.swarm()));
+        }
+        let robot = entry.id().frame.robot;
+        if !self.members.contains_key(&robot) {
+            return Err(IngestError::UnknownOrigin(robot));
+        }
+        Ok(entry)
+    }
+
+    /// Whether a log of this frame is or may be held.
+    pub(super) fn check_epoch(&self, frame: FrameId) -> Result<(), IngestError> {
+        let known = self.slots.contains_key(&frame);
+        if known || self.epochs_of(frame.robot).count() < self.epochs_per_robot_max {
+            return Ok(());
+        }
+        Err(IngestError::EpochLimit(frame.robot))
+    }
+
+    pub(super) fn check_seq(&self, id: EntryId) -> Result<(), IngestError> {
+        if id.seq < self.entries_per_frame_max { Ok(()) } else { Err(IngestError::SeqLimit(id)) }
+    }
+
+    pub(super) fn verify(&self, entry: &Entry) -> Result<(), IngestError> {
+        let robot = entry.id().frame.robot;
+        let member = self.members.get(&robot).ok_or(IngestError::UnknownOrigin(robot))?;
+        Ok(entry.verify(&member.key)?)
+    }
+
+    pub(super) fn log(&self, frame: FrameId) -> Option<&Log> {
+        match self.slots.get(&frame) {
+            Some(Slot::Log(log)) => Some(log),
+            _ => None,
+        }
+    }
+
+    pub(super) fn logs(&self) -> impl Iterator<Item = (FrameId, &Log)> {
+        self.slots.iter().filter_map(|(frame, slot)| match slot {
+            Slot::Log(log) => Some((*frame, log)),
+            Slot::Forked(_) => None,
+        })
+    }
+
+    pub(super) fn log_mut(&mut self, frame: FrameId) -> &mut Log {
+        let slot = self.slots.entry(frame).or_insert_with(|| Slot::Log(Log::default()));
+        match slot {
+            Slot::Log(log) => log,
+            Slot::Forked(_) => unreachable!("callers refuse quarantined logs first"),
+        }
+    }
+
+    /// Pushes a verified entry whose place is the next free one.
+    fn push(&mut self, entry: Entry, bytes: &[u8]) -> Result<(), IngestError> {
+        let id = entry.id();
+        let link = self.log(id.frame).map_or(Link::Fits, |log| log.link(&entry));
+        match link {
+            Link::Fits => {
+                let log = self.log_mut(id.frame);
+                log.received = true;
+                log.entries.push(Held::new(&entry, bytes));
+                Ok(())
+            }
+            Link::FloorFell => Err(IngestError::FloorFell(id)),
+            Link::Contradicts => {
+                let last = self.log(id.frame).and_then(|log| log.entries.last());
+                let other = last.map(|held| held.bytes.to_vec()).unwrap_or_default();
+                Err(self.fork(id.frame, &other, bytes))
+            }
+        }
+    }
+
+    fn fork(&mut self, frame: FrameId, a: &[u8], b: &[u8]) -> IngestError {
+        self.quarantine(frame, a, b);
+        IngestError::Fork(frame)
+    }
+
+    /// Keeps a verified entry until its predecessor comes; of too many, those nearest to what is held.
+    fn hold_early(&mut self, entry: Entry, bytes: &[u8]) -> Result<Ingested, IngestError> {
+        let id = entry.id();
+        if let Some(other) = self.log(id.frame).and_then(|log| log.early.get(&id.seq)) {
+            let other = other.encode();
+            return Err(self.fork(id.frame, &other, bytes));
+        }
+        let robot = id.frame.robot;
+        let all = FrameId { robot, epoch: 0 }..=FrameId { robot, epoch: u32::MAX };
+        let waiting = self.slots.range(all).filter_map(|(frame, slot)| match slot {
+            Slot::Log(log) => Some((*frame, log)),
+            Slot::Forked(_) => None,
+        });
+        let (mut count, mut farthest) = (0, None);
+        for (frame, log) in waiting {
+            count += log.early.len();
+            let last = log.early.keys().next_back().map(|seq| (seq - log.next_seq(), EntryId { frame, seq: *seq }));
+            farthest = farthest.max(last);
+        }
+        if count >= EARLY_PER_ROBOT_MAX {
+            match farthest {
+                Some((distance, far)) if id.seq - self.next_seq(id.frame) < distance => {
+                    self.log_mut(far.frame).early.remove(&far.seq);
+                }
+                _ => return Err(IngestError::TooEarly(id)),
+            }
+        }
+        let log = self.log_mut(id.frame);
+        log.received = true;
+        log.early.insert(id.seq, entry);
+        Ok(Ingested::Early(id))
+    }
+
+    fn take_early(&mut self, frame: FrameId) -> Option<Entry> {
+        let Some(Slot::Log(log)) = self.slots.get_mut(&frame) else { return None };
+        log.early.remove(&log.next_seq())
+    }
+}

@@ -1,0 +1,255 @@
+//! Cuts a stream of keyframes into submaps. A submap ends with the keyframe that took the body `distance_m` or
+//! `rotation_deg` away from the submap's anchor (its first body pose), or that is its `keyframes_max`-th; the next
+//! keyframe anchors the next one, and the odometry between consecutive anchors compounds every motion in between, so
+//! that the anchors chain without gaps.
+
+use super::odometry::{across_gap, isotropic, motion};
+use super::thinning::Thinner;
+use super::{Keyframe, PoseWithCovariance};
+use crate::config::SubmapConfig;
+use crate::geometry::Se3;
+use crate::time::Stamp;
+use nalgebra::Vector3;
+use thiserror::Error;
+
+/// Points in one keyframe at most: four times a dense depth image of 640×480.
+pub const POINTS_PER_KEYFRAME_MAX: usize = 1 << 20;
+/// Lengths of a submap (`distance_m`) that a body may move between two keyframes; more is another frame.
+pub const JUMP_SUBMAPS_MAX: f64 = 10.0;
+/// Farthest a body may be from its frame's origin, in frame units: beyond it f32 clouds and f64 poses lose accuracy.
+pub const POSITION_MAX: f64 = 1e7;
+/// Standard deviation (m and rad) of the first anchor in its frame: where the frame lies is a convention, so this is
+/// small, but not so small that it spoils the conditioning of an estimate.
+pub const FIRST_ANCHOR_SIGMA: f64 = 1e-4;
+
+/// A finished stretch of a robot's own trajectory.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Submap {
+    /// Position along the trajectory of this epoch, from 0.
+    pub index: u32,
+    /// Stamps of the first and last keyframe.
+    pub stamps: [Stamp; 2],
+    /// `t_prev_this`: this anchor in the previous submap's. For index 0 `t_frame_this`, with standard deviations of
+    /// [`FIRST_ANCHOR_SIGMA`].
+    pub odometry: PoseWithCovariance,
+    /// Pose of the anchor in the SLAM's frame.
+    pub t_frame_anchor: Se3,
+    /// `t_anchor_body` of each keyframe.
+    pub keyframes: Vec<Se3>,
+    /// The cloud, thinned to one point per voxel, in the anchor frame; ordered by voxel.
+    pub cloud: Vec<[f32; 3]>,
+    /// For each point the position (in `keyframes`) of the keyframe that saw it first.
+    pub seen_from: Vec<u16>,
+}
+
+/// Why a keyframe was refused. The builder is as it was before; only the odometry across the refused keyframe becomes
+/// less certain.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum KeyframeError {
+    /// The stamp is not after the last one.
+    #[error("keyframe stamp {stamp} ns is not after the last one, {last} ns; send keyframes in order, once")]
+    StampNotRising {
+        /// The keyframe's stamp, ns.
+        stamp: i64,
+        /// The last accepted stamp, ns.
+        last: i64,
+    },
+    /// A translation is NaN, infinite or farther than [`POSITION_MAX`] from the origin.
+    #[error("keyframe position is not finite or beyond {POSITION_MAX} from the origin; use a local frame")]
+    BadPosition,
+    /// A coordinate of a point is NaN or infinite.
+    #[error("point {index} of the keyframe is not finite; leave out invalid returns")]
+    PointNotFinite {
+        /// Position in the keyframe's points.
+        index: usize,
+    },
+    /// More points than a keyframe may hold.
+    #[error("keyframe has {count} points, at most {POINTS_PER_KEYFRAME_MAX} are accepted; thin it first")]
+    TooManyPoints {
+        /// How many it has.
+        count: usize,
+    },
+    /// The body moved farther than any motion: the SLAM was restarted or relocalised.
+    #[error("the body jumped by {moved:.1} since the last keyframe, more than {allowed:.1}; begin a new epoch")]
+    Jump {
+        /// Distance from the last keyframe, frame units.
+        moved: f64,
+        /// The most that is accepted: [`JUMP_SUBMAPS_MAX`] × `distance_m`.
+        allowed: f64,
+    },
+}
+
+/// Cuts keyframes into submaps; see the [module](self).
+#[derive(Clone, Debug)]
+pub struct SubmapBuilder {
+    config: SubmapConfig,
+    next_index: u32,
+    /// The last accepted keyframe, without its points.
+    last: Option<Keyframe>,
+    /// `t_anchor_body` since the anchor of the last finished submap (before the first: since the frame's origin).
+    since_finished: Option<PoseWithCovariance>,
+    /// Anchor of the last finished submap before a restart, until the first keyframe after it.
+    resumed_at: Option<Se3>,
+    open: Option<Open>,
+    /// A keyframe was refused since the last accepted one.
+    gap: bool,
+}
+
+#[derive(Clone, Debug)]
+struct Open {
+    stamps: [Stamp; 2],
+    odometry: PoseWithCovariance,
+    t_frame_anchor: Se3,
+    t_anchor_body: PoseWithCovariance,
+    keyframes: Vec<Se3>,
+    cloud: Thinner,
+}
+
+impl SubmapBuilder {
+    /// A builder at the start of a new frame.
+    pub fn new(config: SubmapConfig) -> Self {
+        Self {
+            config,
+            next_index: 0,
+            last: None,
+            since_finished: None,
+            resumed_at: None,
+            open: None,
+            gap: false,
+        }
+    }
+
+    /// A builder that goes on after a restart of the agent (not of the SLAM): submaps below `next_index` exist, the
+    /// last one anchored at `t_frame_last_anchor`. The motion since then was not observed: the next submap's odometry
+    /// takes its mean from the SLAM and its covariance from `gap_sigma_per_m`. Without the last anchor's pose the
+    /// frame's origin stands in for it.
+    pub fn resume(config: SubmapConfig, next_index: u32, t_frame_last_anchor: Option<Se3>) -> Self {
+        let resumed_at = (next_index > 0).then(|| t_frame_last_anchor.unwrap_or_else(Se3::identity));
+        Self { next_index, resumed_at, ..Self::new(config) }
+    }
+
+    /// Takes the next keyframe; returns the submap that it closed, if it closed one.
+    ///
+    /// # Errors
+    /// [`KeyframeError`] if the keyframe is refused.
+    pub fn push(&mut self, keyframe: Keyframe) -> Result<Option<Submap>, KeyframeError> {
+        if let Err(error) = self.check(&keyframe) {
+            // A repeated or late keyframe is no loss; any other leaves a hole in the odometry.
+            self.gap |= !matches!(error, KeyframeError::StampNotRising { .. });
+            return Err(error);
+        }
+        self.track(&keyframe);
+        self.extend(&keyframe);
+        self.last = Some(Keyframe { points: Vec::new(), ..keyframe });
+        self.gap = false;
+        Ok(if self.is_complete() { self.flush() } else { None })
+    }
+
+    /// Closes the open submap now, if it holds a keyframe.
+    pub fn flush(&mut self) -> Option<Submap> {
+        let open = self.open.take()?;
+        let index = self.next_index;
+        self.next_index = index.saturating_add(1);
+        self.since_finished = Some(open.t_anchor_body);
+        let (cloud, seen_from) = open.cloud.finish();
+        Some(Submap {
+            index,
+            stamps: open.stamps,
+            odometry: open.odometry,
+            t_frame_anchor: open.t_frame_anchor,
+            keyframes: open.keyframes,
+            cloud,
+            seen_from,
+        })
+    }
+
+    /// Where the body is: the index of the last finished submap, `t_anchor_body` from that submap's anchor, and the
+    /// stamp of the last keyframe. `None` before the first submap is finished, and after a restart until a keyframe.
+    pub fn body_since_anchor(&self) -> Option<(u32, PoseWithCovariance, Stamp)> {
+        let index = self.next_index.checked_sub(1)?;
+        Some((index, self.since_finished?, self.last.as_ref()?.stamp))
+    }
+
+    fn check(&self, keyframe: &Keyframe) -> Result<(), KeyframeError> {
+        if let Some(last) = self.last.as_ref().map(|k| k.stamp).filter(|&last| keyframe.stamp <= last) {
+            return Err(KeyframeError::StampNotRising { stamp: keyframe.stamp.0, last: last.0 });
+        }
+        // Negated, so that NaN is refused too.
+        if !keyframe.pose.pose.translation.iter().all(|x| x.abs() <= POSITION_MAX) {
+            return Err(KeyframeError::BadPosition);
+        }
+        if keyframe.points.len() > POINTS_PER_KEYFRAME_MAX {
+            return Err(KeyframeError::TooManyPoints { count: keyframe.points.len() });
+        }
+        if let Some(index) = keyframe.points.iter().position(|p| p.iter().any(|x| !x.is_finite())) {
+            return Err(KeyframeError::PointNotFinite { index });
+        }
+        let allowed = JUMP_SUBMAPS_MAX * self.config.distance_m;
+        let moved = self.last.as_ref().map_or(0.0, |last| {
+            (keyframe.pose.pose.translation - last.pose.pose.translation).norm()
+        });
+        if moved > allowed {
+            return Err(KeyframeError::Jump { moved, allowed });
+        }
+        Ok(())
+    }
+
+    /// Compounds the motion up to `keyframe` onto the two running poses.
+    fn track(&mut self, keyframe: &Keyframe) {
+        let Some(last) = &self.last else {
+            self.since_finished = self.resumed_at.take().map(|t_frame_anchor| {
+                let t_anchor_body = t_frame_anchor.inverse() * keyframe.pose.pose;
+                across_gap(&t_anchor_body, &self.config, &keyframe.pose.covariance)
+            });
+            return;
+        };
+        let step = motion(last, keyframe, self.gap, &self.config);
+        self.since_finished = self.since_finished.map(|since| since.compose(&step));
+        if let Some(open) = &mut self.open {
+            open.t_anchor_body = open.t_anchor_body.compose(&step);
+        }
+    }
+
+    /// Adds `keyframe` to the open submap, which it anchors if none is open.
+    fn extend(&mut self, keyframe: &Keyframe) {
+        let open = self.open.get_or_insert_with(|| {
+            let at_anchor = isotropic(FIRST_ANCHOR_SIGMA, FIRST_ANCHOR_SIGMA, &keyframe.pose.covariance);
+            let first = PoseWithCovariance { pose: keyframe.pose.pose, covariance: at_anchor };
+            Open {
+                stamps: [keyframe.stamp; 2],
+                odometry: self.since_finished.unwrap_or(first),
+                t_frame_anchor: keyframe.pose.pose,
+                t_anchor_body: PoseWithCovariance { pose: Se3::identity(), covariance: isotropic(ZERO_SIGMA, ZERO_SIGMA, &at_anchor) },
+                keyframes: Vec::new(),
+                cloud: Thinner::new(self.config.voxel_m, self.config.points_max),
+            }
+        });
+        let t_anchor_body = open.t_frame_anchor.inverse() * keyframe.pose.pose;
+        // The mean comes from the SLAM's poses, not from products of them, so that it does not drift by rounding.
+        open.t_anchor_body.pose = t_anchor_body;
+        open.stamps[1] = keyframe.stamp;
+        let position = u16::try_from(open.keyframes.len()).unwrap_or(u16::MAX);
+        open.keyframes.push(t_anchor_body);
+        let rotation = t_anchor_body.rotation.matrix();
+        let points = keyframe.points.iter().map(|p| {
+            (rotation * Vector3::from(p.map(f64::from)) + t_anchor_body.translation).into()
+        });
+        open.cloud.add(points, position);
+    }
+
+    fn is_complete(&self) -> bool {
+        self.open.as_ref().is_some_and(|open| {
+            let moved = &open.t_anchor_body.pose;
+            moved.translation.norm() >= self.config.distance_m
+                || moved.rotation.angle() >= self.config.rotation_deg.to_radians()
+                || open.keyframes.len() >= self.config.keyframes_max as usize
+        })
+    }
+}
+
+/// Stands for a standard deviation of zero: an anchor in itself.
+const ZERO_SIGMA: f64 = 1e-8;
+
+#[cfg(test)]
+#[path = "builder_tests.rs"]
+mod tests;

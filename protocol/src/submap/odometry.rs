@@ -1,0 +1,72 @@
+//! Covariance of the motion between two keyframes: as reported, or derived from the covariances of absolute poses, or
+//! assumed across a gap. Local perturbations throughout (MATH §1).
+
+use super::{CovarianceOf, Keyframe};
+use crate::config::SubmapConfig;
+use crate::geometry::{Covariance, PoseWithCovariance, Se3};
+use nalgebra::Matrix6;
+
+/// Least standard deviation of a motion derived from pose covariances, per unit travelled: below what any odometry
+/// holds, above what a difference of two nearly equal covariances leaves by rounding.
+const DERIVED_SIGMA_PER_M: f64 = 1e-3;
+/// ...and per radian turned.
+const DERIVED_SIGMA_PER_RAD: f64 = 1e-3;
+/// ...and, at rest, in voxels and in radians.
+const DERIVED_SIGMA_VOXELS: f64 = 1e-3;
+const DERIVED_SIGMA_RAD: f64 = 1e-4;
+/// Turn assumed possible unnoticed across a gap of one submap's length, rad; scaled by `gap_sigma_per_m` as the rest.
+const GAP_TURN_PER_SUBMAP: f64 = 0.2;
+
+/// `t_last_next` with the covariance of its local perturbation; `gap` says that keyframes between the two were lost.
+pub fn motion(last: &Keyframe, next: &Keyframe, gap: bool, config: &SubmapConfig) -> PoseWithCovariance {
+    let pose = last.pose.pose.inverse() * next.pose.pose;
+    let reported = match (next.covariance_of, last.covariance_of) {
+        (CovarianceOf::Motion, _) => Some(next.pose.covariance),
+        (CovarianceOf::Pose, CovarianceOf::Pose) => Some(derived(last, next, &pose, config)),
+        (CovarianceOf::Pose, CovarianceOf::Motion) => None,
+    };
+    let covariance = match reported {
+        // Differences of poses span a gap by themselves; a motion covers only the last step of it.
+        Some(covariance) if gap && next.covariance_of == CovarianceOf::Motion => {
+            covariance.plus(&across_gap(&pose, config, &next.pose.covariance).covariance)
+        }
+        Some(covariance) => covariance,
+        None => across_gap(&pose, config, &next.pose.covariance).covariance,
+    };
+    PoseWithCovariance { pose, covariance }
+}
+
+/// A motion over which odometry is not known: σ = `gap_sigma_per_m` × (distance + one voxel) for the translation and
+/// `gap_sigma_per_m` × (turn + 0.2 rad per submap's length) for the rotation.
+pub fn across_gap(pose: &Se3, config: &SubmapConfig, otherwise: &Covariance<6>) -> PoseWithCovariance {
+    let distance = pose.translation.norm() + config.voxel_m;
+    let turn = pose.rotation.angle() + GAP_TURN_PER_SUBMAP * distance / config.distance_m;
+    let (rho, phi) = (config.gap_sigma_per_m * distance, config.gap_sigma_per_m * turn);
+    PoseWithCovariance { pose: *pose, covariance: isotropic(rho, phi, otherwise) }
+}
+
+/// A covariance with standard deviations `rho` and `phi` on every axis; `otherwise` where they are out of range.
+pub fn isotropic(rho: f64, phi: f64, otherwise: &Covariance<6>) -> Covariance<6> {
+    Covariance::from_sigmas([rho, rho, rho, phi, phi, phi]).unwrap_or(*otherwise)
+}
+
+/// Σ_M = Σ_next − Ad(M⁻¹) Σ_last Ad(M⁻¹)ᵀ: what compounding must have added, if the SLAM's poses form a chain. A loop
+/// closure between the two makes it indefinite, so it is raised to a floor in every direction.
+fn derived(last: &Keyframe, next: &Keyframe, t_last_next: &Se3, config: &SubmapConfig) -> Covariance<6> {
+    let ad = t_last_next.inverse().adjoint();
+    let difference = next.pose.covariance.matrix() - ad * last.pose.covariance.matrix() * ad.transpose();
+    let rho = DERIVED_SIGMA_PER_M * t_last_next.translation.norm() + DERIVED_SIGMA_VOXELS * config.voxel_m;
+    let phi = DERIVED_SIGMA_PER_RAD * t_last_next.rotation.angle() + DERIVED_SIGMA_RAD;
+    raised(&difference, &isotropic(rho, phi, &next.pose.covariance))
+}
+
+/// The smallest covariance that is at least `m` and at least `floor` in every direction of the floor's metric.
+fn raised(m: &Matrix6<f64>, floor: &Covariance<6>) -> Covariance<6> {
+    let sigmas = floor.sigmas();
+    let scaled = Matrix6::from_fn(|r, c| 0.5 * (m[(r, c)] + m[(c, r)]) / (sigmas[r] * sigmas[c]));
+    let eigen = scaled.symmetric_eigen();
+    let values = eigen.eigenvalues.map(|v| if v.is_finite() { v.max(1.0) } else { 1.0 });
+    let lifted = eigen.eigenvectors * Matrix6::from_diagonal(&values) * eigen.eigenvectors.transpose();
+    let m = Matrix6::from_fn(|r, c| 0.5 * (lifted[(r, c)] + lifted[(c, r)]) * sigmas[r] * sigmas[c]);
+    Covariance::new(m).unwrap_or(*floor)
+}

@@ -1,0 +1,120 @@
+//! How messages look to people: hexadecimal ids, poses as translation, quaternion and standard deviations.
+
+use super::beacon::Beacon;
+use super::entry::Entry;
+use super::fact::{Fact, VerdictOutcome};
+use super::have::{HaveVector, Head};
+use crate::geometry::{PoseWithCovariance, Relative};
+use crate::ids::{Hash, RobotId};
+use core::fmt::Display;
+use serde::{Serialize, Serializer};
+use serde_json::{Value, json};
+
+/// An id as text for people, as bytes on the wire.
+pub(super) fn id<S: Serializer, T: Display + Serialize>(id: &T, s: S) -> Result<S::Ok, S::Error> {
+    if s.is_human_readable() { s.collect_str(id) } else { id.serialize(s) }
+}
+
+/// A root hash, likewise.
+pub(super) fn tag<S: Serializer>(tag: &[u8; 8], s: S) -> Result<S::Ok, S::Error> {
+    if s.is_human_readable() { s.collect_str(&RobotId(*tag)) } else { tag.serialize(s) }
+}
+
+/// Only the number of bytes.
+pub(super) fn length<S: Serializer>(bytes: &[u8], s: S) -> Result<S::Ok, S::Error> {
+    s.serialize_u64(bytes.len() as u64)
+}
+
+pub(super) fn beacon<S: Serializer>(beacon: &Beacon, s: S) -> Result<S::Ok, S::Error> {
+    json!({
+        "robot": beacon.robot().to_string(),
+        "anchor": beacon.anchor.to_string(),
+        "stamp_secs": beacon.stamp.as_secs_f64(),
+        "counter": beacon.counter,
+        "t_anchor_body": pose(&beacon.t_anchor_body),
+    })
+    .serialize(s)
+}
+
+pub(super) fn have<S: Serializer>(have: &HaveVector, s: S) -> Result<S::Ok, S::Error> {
+    let head = |head: &Head| match head {
+        Head::Log { len, tag } => json!({ "len": len, "tag": format!("{:08x}", u32::from_be_bytes(*tag)) }),
+        Head::Forked => json!("forked"),
+    };
+    let heads: serde_json::Map<_, _> = have.heads.iter().map(|(frame, h)| (frame.to_string(), head(h))).collect();
+    json!({
+        "after": have.after.map(|frame| frame.to_string()),
+        "until": have.until.map(|frame| frame.to_string()),
+        "heads": heads,
+    })
+    .serialize(s)
+}
+
+/// An entry from its bytes, or what is wrong with them.
+pub(super) fn entry(bytes: &[u8]) -> Value {
+    match Entry::decode(bytes) {
+        Ok(entry) => json!({
+            "id": entry.id().to_string(),
+            "kind": Fact::kind_name(entry.kind()),
+            "floor": entry.floor(),
+            "previous": entry.previous().to_string(),
+            "hash": Hash::of(bytes).to_string(),
+            "len": bytes.len(),
+            "fact": entry.fact().map_or_else(|error| json!({ "error": error.to_string() }), |f| fact(&f)),
+        }),
+        Err(error) => json!({ "len": bytes.len(), "error": error.to_string() }),
+    }
+}
+
+fn fact(fact: &Fact) -> Value {
+    match fact {
+        Fact::Submap(f) => json!({
+            "index": f.index,
+            "stamps_secs": f.stamps.map(|stamp| stamp.as_secs_f64()),
+            "odometry": pose(&f.odometry),
+            "extent": f.extent,
+            "summary_len": f.summary.len(),
+            "keypoint_count": f.keypoint_count,
+            "blob": f.blob.to_string(),
+            "scale": f.scale,
+        }),
+        Fact::Alignment(f) => json!({
+            "i": f.i.to_string(),
+            "j": f.j.to_string(),
+            "t_i_j": relative(&f.t_i_j),
+            "sigma": f.sigma,
+            "support": f.support,
+            "log10_nfa": f.log10_nfa,
+            "blobs": f.blobs.map(|blob| blob.to_string()),
+        }),
+        Fact::Verdict(f) => json!({
+            "alignment": f.alignment.to_string(),
+            "outcome": match &f.outcome {
+                VerdictOutcome::Measured { t_i_j, sigma, support } => {
+                    json!({ "t_i_j": relative(t_i_j), "sigma": sigma, "support": support })
+                }
+                VerdictOutcome::Refused(reason) => json!({ "refused": reason }),
+            },
+        }),
+        Fact::Sighting(f) => json!({
+            "stamp_secs": f.stamp.as_secs_f64(),
+            "i": f.i.to_string(),
+            "j": f.j.to_string(),
+            "t_i_j": pose(&f.t_i_j),
+        }),
+    }
+}
+
+fn pose(p: &PoseWithCovariance) -> Value {
+    relative(&Relative::Metric(*p))
+}
+
+fn relative(r: &Relative) -> Value {
+    let t = r.sim();
+    let sigmas: Vec<f64> = match r {
+        Relative::Metric(p) => p.covariance.sigmas().iter().copied().collect(),
+        Relative::Similarity(s) => s.covariance.sigmas().iter().copied().collect(),
+    };
+    let translation: [f64; 3] = t.translation.into();
+    json!({ "translation": translation, "rotation": t.rotation.xyzw(), "scale": t.scale, "sigmas": sigmas })
+}
