@@ -208,14 +208,27 @@ fn table(report: &Report) -> String {
     text += &format!("\n{:<22} {:>8} {:>7} {:>9}\n", "relation", "m", "deg", "d²");
     for e in &report.frame_errors {
         let d2 = e.d2.map_or_else(|| "-".to_owned(), |d2| format!("{d2:.2}"));
-        text += &format!("{:<22} {:>8.4} {:>7.3} {:>9}\n", format!("{} -> {}", e.own, e.frame), e.metres, e.degrees, d2);
+        text +=
+            &format!("{:<22} {:>8.4} {:>7.3} {:>9}\n", format!("{} -> {}", e.own, e.frame), e.metres, e.degrees, d2);
     }
     let f = &report.faults;
     text += &format!(
         "\nfaults: {} lost, {} in bursts, {} doubled, {} reordered, {} blocked, {} over capacity, {} unanswered, {} \
          killed, {} restarted, {} wiped, {} paused, {} disk refusals, {} new frames, {} left\n",
-        f.lost, f.burst_lost, f.duplicated, f.reordered, f.blocked, f.over_capacity, f.unanswered, f.killed,
-        f.restarted, f.wiped, f.paused, f.disk_refused, f.new_frames, f.left
+        f.lost,
+        f.burst_lost,
+        f.duplicated,
+        f.reordered,
+        f.blocked,
+        f.over_capacity,
+        f.unanswered,
+        f.killed,
+        f.restarted,
+        f.wiped,
+        f.paused,
+        f.disk_refused,
+        f.new_frames,
+        f.left
     );
     text
 }

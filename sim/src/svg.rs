@@ -12,8 +12,7 @@ use std::collections::BTreeMap;
 /// Edge of one of the two panels, in picture units.
 const PANEL: f64 = 480.0;
 /// Colours that readers with colour blindness can tell apart (Okabe and Ito).
-const COLOURS: [&str; 8] =
-    ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6BB1", "#000000"];
+const COLOURS: [&str; 8] = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6BB1", "#000000"];
 
 /// The picture as SVG text.
 pub fn picture<C>(outcome: &Outcome<C>) -> String {

@@ -1,5 +1,7 @@
 //! A recording is what its format says, and the same bytes each time.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "the whole file is a test")]
+
 use merganser_protocol::recording::{
     CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION, XYZ_I16_UNIT_M,
 };

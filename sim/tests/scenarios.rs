@@ -1,5 +1,7 @@
 //! The scenarios that come with the simulator can be read, and say what they are for.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "the whole file is a test")]
+
 use merganser_sim::scenario::Scenario;
 
 #[test]

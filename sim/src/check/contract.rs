@@ -36,7 +36,9 @@ impl Check for Contract {
                 }
             }
             Seen::Output(Output::Answer { token, .. }) if !run.asked.remove(&token.0) => {
-                return Err(format!("robot {robot}: answered {token:?}, which nobody asked or which it answered before"));
+                return Err(format!(
+                    "robot {robot}: answered {token:?}, which nobody asked or which it answered before"
+                ));
             }
             _ => {}
         }

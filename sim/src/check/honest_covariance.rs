@@ -27,8 +27,7 @@ impl Check for HonestCovariance {
         for e in errors {
             let Some(d2) = e.d2 else { continue };
             let chance = puruspe::gammq(3.0, 0.5 * d2.min(1e6));
-            // NaN must not pass.
-            if !(chance * pairs >= FALSE_ALARM) {
+            if chance.is_nan() || chance * pairs < FALSE_ALARM {
                 return Err(format!(
                     "{} places {} {:.4} m and {:.3}° off: d² = {d2:.1}, of which honest covariances have a chance of \
                      {chance:.1e}",

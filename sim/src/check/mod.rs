@@ -196,11 +196,7 @@ pub(crate) mod tests {
     }
 
     /// A last sample of these robots.
-    pub fn sample<'a>(
-        robots: Vec<RobotSample>,
-        truth: &'a BTreeMap<String, Se3>,
-        expect: &'a Expect,
-    ) -> Sample<'a> {
+    pub fn sample<'a>(robots: Vec<RobotSample>, truth: &'a BTreeMap<String, Se3>, expect: &'a Expect) -> Sample<'a> {
         Sample { phase: Phase::End, robots, truth, expect }
     }
 }

@@ -56,8 +56,7 @@ fn compare(one: &str, a: &Frames, other: &str, b: &Frames) -> Result<(), String>
     for frame in shared {
         let of = |frames: &Frames| frames[base].inverse() * frames[frame];
         let difference = of(a).local(&of(b)).amax();
-        // NaN must not pass.
-        if !(difference <= DIFFERENCE_MAX) {
+        if difference.is_nan() || difference > DIFFERENCE_MAX {
             return Err(format!("{one} and {other} differ by {difference:e} on {base} -> {frame}"));
         }
     }

@@ -54,11 +54,11 @@ impl<C: Core> Swarm<C> {
             Event::JobDone { robot, incarnation, id, job } if self.runs(robot, incarnation) => {
                 self.feed(now, robot, Input::JobDone { job: id, result: job.run() });
             }
-            Event::Wake { robot, incarnation, at } if self.runs(robot, incarnation) => {
-                if self.robots[robot].wake == Some(at) {
-                    self.robots[robot].wake = None;
-                    self.feed(now, robot, Input::Timeout);
-                }
+            Event::Wake { robot, incarnation, at }
+                if self.runs(robot, incarnation) && self.robots[robot].wake == Some(at) =>
+            {
+                self.robots[robot].wake = None;
+                self.feed(now, robot, Input::Timeout);
             }
             Event::Hear { observer, subject, version } => {
                 let id = self.robots[subject].id;
@@ -166,7 +166,8 @@ impl<C: Core> Swarm<C> {
                 };
                 for at in self.network.send(now, robot, to, bytes.len(), &mut self.counts) {
                     let bytes = bytes.clone();
-                    self.queue.push(at, Event::Ask { from: robot, from_incarnation: incarnation, to, query, kind, bytes });
+                    self.queue
+                        .push(at, Event::Ask { from: robot, from_incarnation: incarnation, to, query, kind, bytes });
                 }
                 let deadline = now.after(millis(self.network.options().answer_ms_max));
                 self.queue.push(deadline, Event::Answer { to: robot, incarnation, query, bytes: None });

@@ -111,12 +111,12 @@ impl Core for Fake {
                 }
             }
             Input::Received { channel: Channel::Facts, bytes, .. } => self.learn(&bytes),
-            Input::Received { from, channel: Channel::Have, bytes } => {
-                if bytes != self.digest().0 && bug() != Bug::NoRepair {
-                    self.queries += 1;
-                    let query = QueryId(self.queries);
-                    self.outputs.push_back(Output::Ask { query, peer: from, kind: QueryKind::Sync, bytes });
-                }
+            Input::Received { from, channel: Channel::Have, bytes }
+                if bytes != self.digest().0 && bug() != Bug::NoRepair =>
+            {
+                self.queries += 1;
+                let query = QueryId(self.queries);
+                self.outputs.push_back(Output::Ask { query, peer: from, kind: QueryKind::Sync, bytes });
             }
             Input::Asked { token, .. } => {
                 let bytes = self.entries.values().flatten().copied().collect();

@@ -385,9 +385,10 @@ impl<C: Core> Swarm<C> {
     fn update_hearing(&mut self, now: Instant) {
         let options = self.network.options().clone();
         let alive: Vec<bool> = self.robots.iter().map(|r| r.core.is_some() && now >= r.paused_until).collect();
-        for observer in 0..self.robots.len() {
-            for subject in 0..self.robots.len() {
-                let so = alive[subject] && self.robots[observer].core.is_some() && self.network.is_open(subject, observer);
+        for observer in 0..alive.len() {
+            for (subject, &subject_alive) in alive.iter().enumerate() {
+                let running = self.robots[observer].core.is_some();
+                let so = running && subject_alive && self.network.is_open(subject, observer);
                 let hearing = &mut self.robots[observer].hears[subject];
                 if hearing.so == so {
                     continue;

@@ -90,8 +90,21 @@ fn honest_fakes_survive_every_fault_and_every_fault_fires() {
         assert_eq!(outcome.violation, None, "seed {seed}");
         let c = outcome.counts;
         let fired = [
-            c.lost, c.duplicated, c.reordered, c.blocked, c.over_capacity, c.to_the_dead, c.unanswered, c.killed,
-            c.restarted, c.wiped, c.paused, c.delayed_by_pause, c.new_frames, c.disk_refused, c.keyframes_missed,
+            c.lost,
+            c.duplicated,
+            c.reordered,
+            c.blocked,
+            c.over_capacity,
+            c.to_the_dead,
+            c.unanswered,
+            c.killed,
+            c.restarted,
+            c.wiped,
+            c.paused,
+            c.delayed_by_pause,
+            c.new_frames,
+            c.disk_refused,
+            c.keyframes_missed,
         ];
         assert!(fired.iter().all(|&n| n > 0), "seed {seed}: {fired:?}");
         assert_eq!(outcome.robots.len(), 4);
