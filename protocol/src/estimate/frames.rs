@@ -4,8 +4,11 @@
 //! Every alignment is one hypothesis; nothing is sampled. Pair distances under relative trajectory covariances give a
 //! graph of agreement at each of 5 covariance scales in [1, 3]; the maximum clique with the smallest number of false
 //! alarms wins; joint least squares with cross-covariances estimates; a leave-one-out χ² test drops what the others do
-//! not predict. Frames merge at NFA < 1e-4 and 3 alignments, unless a rival disjoint clique does about as well.
-//! *Measured* over 100 seeds: see the tests. Same set of alignments, same answer to the bit, in any order.
+//! not predict. Frames merge at NFA < 1e-4 and 3 alignments, unless a rival disjoint clique does about as well. Same set
+//! of alignments, same answer to the bit, in any order.
+//!
+//! *Measured*, 20 alignments, scales to 3: 4 true 100 %; 10 true v 5 that agree on a lie 100 %; 4 v 3 92 %, else
+//! ambiguous; 4 v 4 ambiguous in 99 %; 1,000 sets of chance alone, none merged. ANEES at 10 alignments 5.88 of 6.
 
 mod clique;
 mod gls;
@@ -32,11 +35,11 @@ pub const ALIGNMENTS_MAX: usize = clique::VERTICES_MAX;
 /// Covariance scales tried, log-spaced from 1 to the configured largest.
 const SCALES: usize = 5;
 /// χ² quantiles at 99 % for 6 and 7 degrees of freedom: the gate of a pair and of a left-out member.
-const CHI2_99: [f64; 2] = [16.811_893_829_770_931, 18.475_306_906_582_36];
+const CHI2_99: [f64; 2] = [16.811_893_829_770_93, 18.475_306_906_582_36];
 /// A rival within this many powers of ten of the best set's NFA makes the frames ambiguous.
 const RIVAL_MARGIN_LOG10: f64 = 1.0;
-/// ...and both together within this many of a set that agrees only at a wide gate and has parts of both.
-const SWALLOWED_MARGIN_LOG10: f64 = 4.0;
+/// A set that agrees at a tighter gate is preferred, or searched for rivals, within this many powers of ten of the best.
+const BLEND_MARGIN_LOG10: f64 = 4.0;
 /// ln 400: the range of scales, 0.05 to 20, over which a false similarity may fall.
 const LOG_SCALE_RANGE: f64 = 5.991_464_547_107_982;
 
@@ -107,6 +110,16 @@ pub struct FrameConsensus<T = PoseWithCovariance> {
     pub covariance_scale: f64,
     /// Log₁₀ of the number of false alarms.
     pub log10_nfa: f64,
+}
+
+impl<T> FrameOutcome<T> {
+    /// The consensus that merges the frames, where there is one.
+    pub fn merged(&self) -> Option<&FrameConsensus<T>> {
+        match self {
+            Self::Merged(consensus) => Some(consensus),
+            _ => None,
+        }
+    }
 }
 
 impl From<&EstimateConfig> for FrameConsensusConfig {
@@ -218,7 +231,7 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         }
         let pairs = Pairs::new(self);
         let everyone = (0..n).map(bit).sum();
-        let found = self.largest(&pairs, everyone);
+        let found = self.unblended(&pairs, self.largest(&pairs, everyone), everyone);
         let Some((best, consensus)) = self.settle(&pairs, found) else { return FrameOutcome::Inconsistent };
         if let Some((first, second)) = self.rivals(&pairs, &best, everyone)
             && let (Some((_, first)), Some((_, second))) = (self.settle(&pairs, first), self.settle(&pairs, second))
@@ -242,6 +255,20 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         let none = Candidate { set: 0, scale: 1.0, log10_nfa: f64::INFINITY, hub: 0 };
         let at_scales = self.scales().map(|scale| self.at_scale(pairs, candidates, scale));
         at_scales.fold(none, |best, c| if c.log10_nfa < best.log10_nfa { c } else { best })
+    }
+
+    /// At a wide gate parts of a truth and of a lie may agree with each other, and a larger blend may beat the truth by
+    /// little. So the tightest set about as improbable as `best` stands in for it, unless it is a part of it.
+    fn unblended(&self, pairs: &Pairs, best: Candidate, everyone: Set) -> Candidate {
+        self.tighter(pairs, &best, everyone).find(|c| c.set & !best.set != 0).unwrap_or(best)
+    }
+
+    /// The maximum cliques at the gates tighter than `best`'s, tightest first, that do nearly as well.
+    fn tighter(&self, pairs: &Pairs, best: &Candidate, everyone: Set) -> impl Iterator<Item = Candidate> {
+        let best = *best;
+        let scales = self.scales().take_while(move |&scale| scale < best.scale);
+        let sets = scales.map(move |scale| self.at_scale(pairs, everyone, scale));
+        sets.filter(move |c| c.log10_nfa <= best.log10_nfa + BLEND_MARGIN_LOG10)
     }
 
     fn at_scale(&self, pairs: &Pairs, candidates: Set, scale: f64) -> Candidate {
@@ -284,12 +311,9 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
     }
 
     /// Two disjoint sets that contradict each other, of which the first explains the alignments nearly as well as
-    /// `best` and the second nearly as well as the first. The first need not be `best` itself: at a wide gate a set may
-    /// have swallowed parts of both.
+    /// `best` and the second nearly as well as the first.
     fn rivals(&self, pairs: &Pairs, best: &Candidate, everyone: Set) -> Option<(Candidate, Candidate)> {
-        let tighter = self.scales().take_while(|&scale| scale < best.scale);
-        let firsts = core::iter::once(*best).chain(tighter.map(|scale| self.at_scale(pairs, everyone, scale)));
-        firsts.filter(|first| first.log10_nfa <= best.log10_nfa + SWALLOWED_MARGIN_LOG10).find_map(|first| {
+        core::iter::once(*best).chain(self.tighter(pairs, best, everyone)).find_map(|first| {
             let second = self.largest(pairs, everyone & !first.set);
             let as_good = second.set.count_ones() >= first.set.count_ones()
                 || second.log10_nfa <= first.log10_nfa + RIVAL_MARGIN_LOG10;
