@@ -23,7 +23,6 @@ use crate::config::EstimateConfig;
 use crate::geometry::{Covariance, Group, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
 use clique::{Set, bit};
 use core::f64::consts::PI;
-use core::marker::PhantomData;
 use gls::Gls;
 use libm::pow;
 use pairs::Pairs;
@@ -128,7 +127,7 @@ impl From<&EstimateConfig> for FrameConsensusConfig {
             alignments_min: config.alignments_min,
             log10_nfa_max: config.log10_nfa_max,
             covariance_scale_max: config.covariance_scale_max,
-            search_edge_min: 5.0,
+            search_edge_min: 2.0,
             rotations: Rotations::Heading,
         }
     }
@@ -182,7 +181,6 @@ struct Measured<'a, const N: usize, G> {
     beta: &'a Trajectory,
     alignments: Vec<Alignment<N, G>>,
     config: &'a FrameConsensusConfig,
-    group: PhantomData<G>,
 }
 
 /// A clique, where it was found and how good it is.
@@ -221,7 +219,7 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         let kept = n.min(ALIGNMENTS_MAX);
         let mut taken = (0..kept).map(|k| k * n / kept).peekable();
         let thinned = keyed.into_iter().enumerate().filter(|(k, _)| taken.next_if_eq(k).is_some());
-        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config, group: PhantomData }
+        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config }
     }
 
     fn outcome(&self) -> FrameOutcome<(G, Covariance<N>)> {
@@ -284,18 +282,13 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
     fn settle(&self, pairs: &Pairs, mut found: Candidate) -> Option<(Candidate, FrameConsensus<(G, Covariance<N>)>)> {
         loop {
             let gls = Gls::solve(self, found.set, found.hub)?;
-            let members = found.set.count_ones();
-            let worst = gls.left_out.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1));
-            if let Some((nth, &d2)) = worst
-                && members > 2
-                && d2 > gate(N, found.scale)
-                && let Some(dropped) = clique::vertices(found.set).nth(nth)
-            {
-                found = self.judged(pairs, found.set & !bit(dropped), found.scale);
+            let unpredicted = self.unpredicted(&found, &gls.left_out);
+            if unpredicted != 0 {
+                found = self.judged(pairs, found.set & !unpredicted, found.scale);
                 continue;
             }
             // The gate's scale bounds the true one; the residuals tell how much of it is needed.
-            let freedom = N as f64 * f64::from(members - 1).max(1.0);
+            let freedom = N as f64 * f64::from(found.set.count_ones() - 1).max(1.0);
             let scale_squared = (gls.chi_squared / freedom).clamp(1.0, found.scale * found.scale);
             let mut used: Vec<usize> = clique::vertices(found.set).map(|l| self.alignments[l].position).collect();
             used.sort_unstable();
@@ -308,6 +301,21 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
             };
             return Some((found, consensus));
         }
+    }
+
+    /// The worst of the members outside the gate: a sixteenth of the set, but at least one, at a time, since one bad member
+    /// spoils the prediction of others. Two members always stay.
+    fn unpredicted(&self, found: &Candidate, left_out: &[f64]) -> Set {
+        let members = left_out.len();
+        let mut outside: Vec<(f64, usize)> = left_out
+            .iter()
+            .zip(clique::vertices(found.set))
+            .filter(|&(&d2, _)| d2 > gate(N, found.scale))
+            .map(|(&d2, l)| (d2, l))
+            .collect();
+        outside.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let dropped = (members / 16).max(1).min(members.saturating_sub(2));
+        outside.iter().take(dropped).map(|&(_, l)| bit(l)).sum()
     }
 
     /// Two disjoint sets that contradict each other, of which the first explains the alignments nearly as well as
