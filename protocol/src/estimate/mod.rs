@@ -17,8 +17,12 @@ pub use joint::{
 };
 
 #[cfg(test)]
+mod hostile_tests;
+#[cfg(test)]
 mod joint_tests;
 #[cfg(test)]
 mod solve_tests;
 #[cfg(test)]
 mod test_graphs;
+#[cfg(test)]
+mod test_world;
