@@ -5,7 +5,8 @@
 
 use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
-use crate::geometry::{PoseWithCovariance, Relative, Se3};
+use super::trajectory::Trajectory;
+use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
@@ -34,8 +35,8 @@ pub(super) struct Chain {
     pub(super) origin: PoseWithCovariance,
     /// `t_prev_this` of the anchors from the second on.
     pub(super) steps: Vec<PoseWithCovariance>,
-    /// `t_frame_anchor`.
-    pub(super) poses: Vec<Se3>,
+    /// The same, compounded.
+    pub(super) trajectory: Trajectory,
 }
 
 /// The admitted problem. An edge counts while its `unused` is `None`.
@@ -187,11 +188,8 @@ impl Chain {
         let usable = odometry.iter().take_while(|p| holds(&Relative::Metric(**p)));
         let steps: Vec<PoseWithCovariance> = usable.copied().collect();
         let origin = *steps.first()?;
-        let mut poses = vec![origin.pose];
-        for step in &steps[1..] {
-            poses.push(poses[poses.len() - 1] * step.pose);
-        }
-        Some(Self { origin, steps: steps[1..].to_vec(), poses })
+        let trajectory = Trajectory::new(steps.iter().copied());
+        Some(Self { origin, steps: steps[1..].to_vec(), trajectory })
     }
 
     /// Largest over smallest variance of its steps: how badly it conditions a component.
@@ -202,7 +200,7 @@ impl Chain {
 
     /// Number of anchors.
     pub(super) fn len(&self) -> usize {
-        self.poses.len()
+        self.trajectory.len()
     }
 
     pub(super) fn ids(&self, frame: FrameId) -> impl Iterator<Item = SubmapId> + use<> {

@@ -6,6 +6,7 @@
 //! - Perturbations are **local (right)**: `T ⊕ δ = T · exp(δ^)`; a stored covariance is that of δ.
 
 pub mod gaussian;
+pub mod group;
 #[cfg(test)]
 mod laws;
 pub mod relative;
@@ -16,6 +17,7 @@ pub mod so3;
 pub(crate) mod test_support;
 
 pub use gaussian::{Covariance, CovarianceError, PoseWithCovariance, SimWithCovariance};
+pub use group::Group;
 pub use relative::{Disagreement, Relative};
 pub use se3::Se3;
 pub use sim3::Sim3;
