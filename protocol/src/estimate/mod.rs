@@ -9,7 +9,6 @@ pub mod marginals;
 mod pairs;
 pub mod residual;
 mod reweight;
-mod similarity;
 pub mod solve;
 mod sparse;
 pub mod trajectory;
@@ -20,8 +19,12 @@ pub use joint::{
 };
 
 #[cfg(test)]
+mod hostile_tests;
+#[cfg(test)]
 mod joint_tests;
 #[cfg(test)]
 mod solve_tests;
 #[cfg(test)]
 mod test_graphs;
+#[cfg(test)]
+mod test_world;
