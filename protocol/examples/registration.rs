@@ -106,6 +106,9 @@ fn run(case: &Case, config: &SolverConfig, cell: &mut Cell) {
             let scale = (sim.scale / case.truth.scale - 1.0).abs();
             if rotation > 5.0 || translation > 0.1 || scale > 0.1 {
                 cell.wrong += 1;
+                if std::env::var("V").is_ok() {
+                    println!("wrong {:.2} {:.1}", found.log10_nfa, found.support);
+                }
                 return;
             }
             cell.rotation.push(rotation);
@@ -113,6 +116,9 @@ fn run(case: &Case, config: &SolverConfig, cell: &mut Cell) {
             cell.translation.push(translation);
             cell.sigma.push(found.sigma);
             cell.nfa.push(found.log10_nfa);
+            if std::env::var("V").is_ok() {
+                println!("right {:.2} {:.1}", found.log10_nfa, found.support);
+            }
             let d = distance(&found.t_target_source, &case.truth);
             cell.distance.push(d);
             cell.covered += usize::from(d < 1.0);
@@ -141,7 +147,13 @@ fn main() {
                 true => Model::Similarity { scale_min: 0.4, scale_max: 2.5 },
                 false => Model::Rigid,
             };
-            let config = SolverConfig { model, sigma_max, support_min: 4.0, ..SolverConfig::default() };
+            let config = SolverConfig {
+                model,
+                sigma_max,
+                support_min: 4.0,
+                log10_nfa_provisional: Some(-1.0),
+                ..SolverConfig::default()
+            };
             let cell = cells.entry(name[..name.len() - 4].to_string()).or_default();
             run(&read(file), &config, cell);
         }
