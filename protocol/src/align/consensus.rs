@@ -17,7 +17,7 @@ const EVALUATED: usize = 3;
 /// Ratio of a SIM(3) search step's largest to its smallest scale.
 const SCALE_STEP: f64 = 1.1;
 /// Matches of a rival expected in the prefix in which it is sought.
-const RIVAL_EXPECTED: f64 = 12.0;
+const RIVAL_EXPECTED: f64 = 24.0;
 /// An inlier lies within so many σ̂: the 99 % quantile of χ₃, and a margin.
 const INLIER_REACH: f64 = 4.0;
 

@@ -38,7 +38,8 @@ pub(super) fn estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
     let information = information(context, fit);
     let axes = information.rotation.symmetric_eigen();
     let weakest = axes.eigenvalues.min();
-    if !(weakest > 1e-12 * axes.eigenvalues.max()) {
+    let determined = weakest > 1e-12 * axes.eigenvalues.max();
+    if !determined {
         return None;
     }
     let inflation = inflation(3.0 * fit.support() - context.dof(), context.with_scale);
