@@ -1,1 +1,174 @@
-//! Reading recordings.
+//! Recordings on disk ([`merganser_protocol::recording`] is the format): opening and checking them, writing them, and
+//! making them from other people's data sets.
+//!
+//! [`Recording::open`] reads the manifest and both tables and looks for every cloud; the clouds themselves are read one
+//! by one, by [`Recording::keyframe`]. A bad recording is refused with one error that names file and line.
+
+pub mod cloud;
+mod drift;
+mod error;
+pub mod import;
+mod import_lidar;
+mod import_rgbd;
+mod pcd;
+pub mod ply;
+mod table;
+mod write;
+
+pub use drift::Drift;
+pub use error::{Problem, RecordingError};
+pub use table::{KeyframeLine, TruthLine};
+pub use write::Writer;
+
+use error::on;
+use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, Manifest, VERSION};
+use merganser_protocol::submap::Keyframe;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Name of the manifest.
+pub const MANIFEST: &str = "recording.toml";
+/// Name of the table of keyframes.
+pub const KEYFRAMES: &str = "keyframes.csv";
+/// Name of the table of true poses.
+pub const TRUTH: &str = "truth.csv";
+/// Bytes of a manifest at most.
+const MANIFEST_BYTES_MAX: u64 = 1 << 20;
+
+/// A checked recording: everything but the points is in memory.
+#[derive(Clone, Debug)]
+pub struct Recording {
+    folder: PathBuf,
+    manifest: Manifest,
+    keyframes: Vec<KeyframeLine>,
+    truth: Option<Vec<TruthLine>>,
+}
+
+impl Recording {
+    /// Opens and checks the recording in `folder`; clouds are only seen to exist.
+    ///
+    /// # Errors
+    /// [`RecordingError`] for the first problem.
+    pub fn open(folder: &Path) -> Result<Self, RecordingError> {
+        let manifest = read_manifest(&folder.join(MANIFEST))?;
+        let table = folder.join(KEYFRAMES);
+        let keyframes = table::read_keyframes(&table)?;
+        if keyframes.len() != manifest.keyframes {
+            return Err(Problem::Count { found: keyframes.len(), stated: manifest.keyframes }.of(table));
+        }
+        for (index, line) in keyframes.iter().enumerate() {
+            if !folder.join(&line.cloud).is_file() {
+                return Err(Problem::CloudMissing(line.cloud.display().to_string()).at(table, index + 2));
+            }
+        }
+        let truth = folder.join(TRUTH);
+        let truth = if truth.exists() { Some(read_truth(&truth, &keyframes)?) } else { None };
+        Ok(Self { folder: folder.into(), manifest, keyframes, truth })
+    }
+
+    /// Where it lies.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// What it is.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// Stamps, poses and covariances, in rising order of stamps; never empty.
+    pub fn keyframes(&self) -> &[KeyframeLine] {
+        &self.keyframes
+    }
+
+    /// `t_world_body` at each keyframe, if the recording has it.
+    pub fn truth(&self) -> Option<&[TruthLine]> {
+        self.truth.as_deref()
+    }
+
+    /// Number of keyframes, at least 1.
+    #[expect(clippy::len_without_is_empty, reason = "a recording without keyframes is refused")]
+    pub fn len(&self) -> usize {
+        self.keyframes.len()
+    }
+
+    /// Time from the first keyframe to the last, s.
+    pub fn duration_secs(&self) -> f64 {
+        match (self.keyframes.first(), self.keyframes.last()) {
+            (Some(first), Some(last)) => last.stamp.secs_since(first.stamp),
+            _ => 0.0,
+        }
+    }
+
+    /// The points of keyframe `index`, body frame, m.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if the cloud cannot be used, or there is no such keyframe.
+    pub fn points(&self, index: usize) -> Result<Vec<[f32; 3]>, RecordingError> {
+        let line = self.line(index)?;
+        cloud::read(&self.folder.join(&line.cloud), self.manifest.clouds)
+    }
+
+    /// Keyframe `index` with its points.
+    ///
+    /// # Errors
+    /// As [`Recording::points`].
+    pub fn keyframe(&self, index: usize) -> Result<Keyframe, RecordingError> {
+        let points = self.points(index)?;
+        let line = self.line(index)?;
+        let covariance_of = self.manifest.covariance_of;
+        Ok(Keyframe { stamp: line.stamp, pose: line.pose, covariance_of, points })
+    }
+
+    fn line(&self, index: usize) -> Result<&KeyframeLine, RecordingError> {
+        let missing = || Problem::Data(format!("there is no keyframe {index}, only {}", self.len())).of(&self.folder);
+        self.keyframes.get(index).ok_or_else(missing)
+    }
+}
+
+/// Reads the manifest. Format and version are looked at first, so that a recording of a later version is told as such
+/// and not by whatever else is new in it.
+fn read_manifest(path: &Path) -> Result<Manifest, RecordingError> {
+    let file = on(path, std::fs::File::open(path))?;
+    let mut text = String::new();
+    on(path, file.take(MANIFEST_BYTES_MAX).read_to_string(&mut text))?;
+    let refuse = |error: toml::de::Error| {
+        let problem = Problem::Manifest(error.message().trim_end().to_owned());
+        let line = error.span().map(|span| text.bytes().take(span.start).filter(|b| *b == b'\n').count() + 1);
+        RecordingError { path: path.into(), line, problem }
+    };
+    let table: toml::Table = text.parse().map_err(refuse)?;
+    match table.get("format") {
+        Some(toml::Value::String(format)) if format == FORMAT => {}
+        Some(other) => return Err(Problem::Format(other.as_str().unwrap_or_default().into()).of(path)),
+        None => return Err(Problem::Manifest(format!("has no line format = {FORMAT:?}")).of(path)),
+    }
+    if let Some(toml::Value::Integer(version)) = table.get("version")
+        && *version != i64::from(VERSION)
+    {
+        return Err(Problem::Version(*version).of(path));
+    }
+    let manifest: Manifest = toml::from_str(&text).map_err(refuse)?;
+    if !(1..=KEYFRAMES_MAX).contains(&manifest.keyframes) {
+        return Err(Problem::KeyframesRange(manifest.keyframes).of(path));
+    }
+    manifest.config.validate().map_err(|error| Problem::Config(error).of(path))?;
+    Ok(manifest)
+}
+
+fn read_truth(path: &Path, keyframes: &[KeyframeLine]) -> Result<Vec<TruthLine>, RecordingError> {
+    let truth = table::read_truth(path)?;
+    for (index, (line, keyframe)) in truth.iter().zip(keyframes).enumerate() {
+        if line.stamp != keyframe.stamp {
+            let problem = Problem::TruthStamp { found: line.stamp.0, expected: keyframe.stamp.0 };
+            return Err(problem.at(path, index + 2));
+        }
+    }
+    if truth.len() != keyframes.len() {
+        return Err(Problem::TruthCount { found: truth.len(), keyframes: keyframes.len() }.of(path));
+    }
+    Ok(truth)
+}
+
+#[cfg(test)]
+mod tests;

@@ -6,7 +6,7 @@ use super::covariance::{self, Estimate};
 use super::prepare::{self, Matches};
 use super::refine::{self, Context, Fit};
 use super::sample::{Candidate, Sampler, Step};
-use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig};
+use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig, Standing};
 
 /// Size of the first prefix of matches searched; each next is four times as large.
 const PREFIX_FIRST: usize = 128;
@@ -16,6 +16,8 @@ const LEVELS: u32 = 5;
 const EVALUATED: usize = 3;
 /// Ratio of a SIM(3) search step's largest to its smallest scale.
 const SCALE_STEP: f64 = 1.1;
+/// Matches of a rival expected in the prefix in which it is sought.
+const RIVAL_EXPECTED: f64 = 24.0;
 /// An inlier lies within so many σ̂: the 99 % quantile of χ₃, and a margin.
 const INLIER_REACH: f64 = 4.0;
 
@@ -34,6 +36,8 @@ pub fn align(problem: &Problem, config: &SolverConfig) -> Result<Result<Alignmen
 struct Evaluated {
     fit: Fit,
     significance: Significance,
+    /// Σ of inlier probabilities over matches that count.
+    support: f64,
 }
 
 struct Search<'a> {
@@ -44,8 +48,8 @@ struct Search<'a> {
     refine: refine::Scratch,
     accept: accept::Scratch,
     /// Best that was not accepted.
-    best_refused: Significance,
-    best_refused_support: f64,
+    refused: Significance,
+    refused_support: f64,
     /// Smallest rotation uncertainty among significant but degenerate fits.
     degenerate: Option<f64>,
 }
@@ -72,8 +76,8 @@ impl<'a> Search<'a> {
             candidates: Vec::new(),
             refine: refine::Scratch::default(),
             accept: accept::Scratch::default(),
-            best_refused: Significance { log10_nfa: f64::INFINITY, count: 0 },
-            best_refused_support: 0.0,
+            refused: Significance { log10_nfa: f64::INFINITY, count: 0 },
+            refused_support: 0.0,
             degenerate: None,
         }
     }
@@ -87,14 +91,11 @@ impl<'a> Search<'a> {
         let Some((mut best, stage)) = self.first_accepted(&pool) else {
             return Err(match self.degenerate {
                 Some(rotation_sigma) => Refusal::Degenerate { rotation_sigma },
-                None => {
-                    let support = self.best_refused_support;
-                    Refusal::NoConsensus { log10_nfa: self.best_refused.log10_nfa, support }
-                }
+                None => Refusal::NoConsensus { log10_nfa: self.refused.log10_nfa, support: self.refused_support },
             });
         };
         if let Some(rival) = self.rival(&best, stage) {
-            let (a, b) = (best.significance.count as f64, rival.significance.count as f64);
+            let (a, b) = (best.support, rival.support);
             if a.min(b) >= self.config.rival_ratio * a.max(b) {
                 return Err(Refusal::Ambiguous { support: a.max(b), rival_support: a.min(b) });
             }
@@ -105,21 +106,28 @@ impl<'a> Search<'a> {
         self.conclude(best)
     }
 
-    /// Searches growing prefixes and σ levels until a fit is accepted.
+    /// Searches growing prefixes and σ levels until a fit is accepted; else the best provisional one of all.
     fn first_accepted(&mut self, pool: &[u32]) -> Option<(Evaluated, Stage)> {
+        let bar = self.config.log10_nfa_provisional.unwrap_or(self.config.log10_nfa_max);
+        let mut best: Option<(Evaluated, Stage)> = None;
         for prefix in prefixes(pool.len()) {
             for level in (0..LEVELS).rev() {
                 let stage = Stage { prefix, level };
-                if let Some(found) = self.step(pool, stage, None) {
-                    return Some((found, stage));
+                let Some(found) = self.step(pool, stage, bar, None) else { continue };
+                let nfa = found.significance.log10_nfa;
+                if best.as_ref().is_none_or(|(b, _)| nfa < b.significance.log10_nfa) {
+                    best = Some((found, stage));
+                }
+                if nfa <= self.config.log10_nfa_max {
+                    return best;
                 }
             }
         }
-        None
+        best
     }
 
-    /// One prefix at one σ level: the best accepted fit. Matches in `taken` do not count.
-    fn step(&mut self, pool: &[u32], stage: Stage, taken: Option<&[bool]>) -> Option<Evaluated> {
+    /// One prefix at one σ level: the best fit with log₁₀ NFA up to `bar`. Matches in `taken` do not count.
+    fn step(&mut self, pool: &[u32], stage: Stage, bar: f64, taken: Option<&[bool]>) -> Option<Evaluated> {
         let sigma = self.config.sigma_max / f64::from(1_u32 << stage.level);
         let prefix = &pool[..stage.prefix.min(pool.len())];
         let mut best: Option<Evaluated> = None;
@@ -128,7 +136,7 @@ impl<'a> Search<'a> {
             let mut candidates = core::mem::take(&mut self.candidates);
             self.sampler.propose(&self.context, prefix, &step, &mut candidates);
             for candidate in candidates.iter().take(EVALUATED) {
-                let Some(found) = self.evaluate(candidate, taken) else { continue };
+                let Some(found) = self.evaluate(candidate, bar, taken) else { continue };
                 if best.as_ref().is_none_or(|b| found.significance.log10_nfa < b.significance.log10_nfa) {
                     best = Some(found);
                 }
@@ -138,16 +146,14 @@ impl<'a> Search<'a> {
         best
     }
 
-    /// Refines a candidate on all matches; `None` unless it is accepted.
-    fn evaluate(&mut self, candidate: &Candidate, taken: Option<&[bool]>) -> Option<Evaluated> {
+    /// Refines a candidate on all matches; `None` unless it is significant, supported and well determined.
+    fn evaluate(&mut self, candidate: &Candidate, bar: f64, taken: Option<&[bool]>) -> Option<Evaluated> {
         let fit = refine::em(&self.context, candidate.motion, &mut self.refine)?;
         let significance = accept::significance(&self.context, &fit, taken, &mut self.accept);
-        let support = fit.support();
-        let enough = (significance.count as f64).min(support) >= self.config.support_min - 0.5;
-        if significance.log10_nfa > self.config.log10_nfa_max || !enough {
-            if significance.log10_nfa < self.best_refused.log10_nfa && taken.is_none() {
-                self.best_refused = significance;
-                self.best_refused_support = support;
+        if significance.log10_nfa > bar || (significance.count as f64) < self.config.support_min {
+            if significance.log10_nfa < self.refused.log10_nfa && taken.is_none() {
+                self.refused = significance;
+                self.refused_support = fit.support();
             }
             return None;
         }
@@ -156,20 +162,25 @@ impl<'a> Search<'a> {
             self.degenerate = Some(self.degenerate.map_or(rotation_sigma, |d| d.min(rotation_sigma)));
             return None;
         }
-        Some(Evaluated { fit, significance })
+        let counts = |i: usize| taken.is_none_or(|t| !t[i]);
+        let support = (0..fit.probabilities.len()).filter(|&i| counts(i)).map(|i| fit.probabilities[i]).sum();
+        Some(Evaluated { fit, significance, support })
     }
 
-    /// The best accepted fit that shares no match with `best`, sought with the effort that found `best`.
+    /// The best significant fit that shares no match with `best`: sought on a prefix in which a rival of weight has
+    /// [`RIVAL_EXPECTED`] matches, at the σ level that found `best` and the next looser one.
     fn rival(&mut self, best: &Evaluated, stage: Stage) -> Option<Evaluated> {
         let reach = INLIER_REACH * best.fit.sigma;
         let taken: Vec<bool> = best.fit.squared.iter().map(|r2| *r2 < reach * reach).collect();
         let pool: Vec<u32> = (0..taken.len() as u32).filter(|&i| !taken[i as usize]).collect();
-        if (pool.len() as f64) < self.config.rival_ratio * best.significance.count as f64 || pool.len() < COUNT_MIN {
+        let weight = self.config.rival_ratio * best.support;
+        if (pool.len() as f64) < weight || pool.len() < COUNT_MIN {
             return None;
         }
-        (stage.level.saturating_sub(1)..=stage.level)
-            .rev()
-            .find_map(|level| self.step(&pool, Stage { level, ..stage }, Some(&taken)))
+        let prefix = ((RIVAL_EXPECTED / weight * pool.len() as f64) as usize).max(stage.prefix);
+        let bar = best.significance.log10_nfa.max(self.config.log10_nfa_max);
+        let looser = stage.level.saturating_sub(1);
+        (looser..=stage.level).rev().find_map(|level| self.step(&pool, Stage { prefix, level }, bar, Some(&taken)))
     }
 
     fn conclude(&mut self, best: Evaluated) -> Result<Alignment, Refusal> {
@@ -180,6 +191,10 @@ impl<'a> Search<'a> {
         let matches = self.context.matches;
         Ok(Alignment {
             t_target_source: relative,
+            standing: match best.significance.log10_nfa <= self.config.log10_nfa_max {
+                true => Standing::Accepted,
+                false => Standing::Provisional,
+            },
             sigma: fit.sigma * fit.motion.residual_unit(),
             inlier_probabilities: matches.distinct_of_input.iter().map(|&k| fit.probabilities[k as usize]).collect(),
             support: fit.support(),

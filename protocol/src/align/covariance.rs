@@ -38,7 +38,8 @@ pub(super) fn estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
     let information = information(context, fit);
     let axes = information.rotation.symmetric_eigen();
     let weakest = axes.eigenvalues.min();
-    if !(weakest > 1e-12 * axes.eigenvalues.max()) {
+    let determined = weakest > 1e-12 * axes.eigenvalues.max();
+    if !determined {
         return None;
     }
     let inflation = inflation(3.0 * fit.support() - context.dof(), context.with_scale);
@@ -110,7 +111,7 @@ fn carried_pose(translation: f64, rotation: &Matrix3<f64>, c: &Vector3<f64>) -> 
     local.fixed_view_mut::<3, 3>(3, 3).copy_from(rotation);
     let mut ad = Matrix6::identity();
     ad.fixed_view_mut::<3, 3>(0, 3).copy_from(&hat(c));
-    Covariance::new(symmetric(ad * local * ad.transpose())).ok()
+    representable(ad * local * ad.transpose())
 }
 
 fn carried_sim(translation: f64, rotation: &Matrix3<f64>, scale: f64, c: &Vector3<f64>) -> Option<Covariance<7>> {
@@ -121,11 +122,14 @@ fn carried_sim(translation: f64, rotation: &Matrix3<f64>, scale: f64, c: &Vector
     let mut ad = SMatrix::<f64, 7, 7>::identity();
     ad.fixed_view_mut::<3, 3>(0, 3).copy_from(&hat(c));
     ad.fixed_view_mut::<3, 1>(0, 6).copy_from(&-c);
-    Covariance::new(symmetric(ad * local * ad.transpose())).ok()
+    representable(ad * local * ad.transpose())
 }
 
-fn symmetric<const N: usize>(m: SMatrix<f64, N, N>) -> SMatrix<f64, N, N> {
-    (m + m.transpose()) * 0.5
+/// The covariance, widened by a hair where a far origin makes it singular in double precision.
+fn representable<const N: usize>(m: SMatrix<f64, N, N>) -> Option<Covariance<N>> {
+    let m = (m + m.transpose()) * 0.5;
+    let widened = || m + SMatrix::from_diagonal(&(m.diagonal() * 1e-11));
+    Covariance::new(m).or_else(|_| Covariance::new(widened())).ok()
 }
 
 /// d F₀.₉₅(d, ν) / χ²₀.₉₅(d): how much wider the 95 % ellipsoid is when σ̂² has ν degrees of freedom.

@@ -82,7 +82,9 @@ pub struct SolverConfig {
     pub sigma_max: f64,
     /// Accept below this log₁₀ of the number of false alarms.
     pub log10_nfa_max: f64,
-    /// Accept from this sum of inlier probabilities on.
+    /// Report as [`Standing::Provisional`] what is not accepted but below this log₁₀ NFA; `None` reports no such.
+    pub log10_nfa_provisional: Option<f64>,
+    /// Accept from this many matches on.
     pub support_min: f64,
     /// A disjoint, itself significant alignment with this share of the support (0 to 1] makes the answer ambiguous.
     pub rival_ratio: f64,
@@ -104,9 +106,10 @@ impl Default for SolverConfig {
             model: Model::Rigid,
             sigma_max: 0.1,
             log10_nfa_max: -4.0,
+            log10_nfa_provisional: None,
             support_min: 6.0,
             rival_ratio: 0.75,
-            rotation_sigma_max: 0.2,
+            rotation_sigma_max: 0.1,
             weighting: Weighting::Auto,
             seed: 0,
             hypotheses_max: 128,
@@ -115,12 +118,23 @@ impl Default for SolverConfig {
     }
 }
 
-/// An accepted alignment.
+/// How sure an alignment is not chance.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Standing {
+    /// Below [`SolverConfig::log10_nfa_max`].
+    Accepted,
+    /// Below [`SolverConfig::log10_nfa_provisional`] only: confirm it by other means before use.
+    Provisional,
+}
+
+/// An alignment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Alignment {
     /// Maps source coordinates into the target frame; covariance of the local perturbation, calibrated so that the
     /// 95 % ellipsoid covers 95 %.
     pub t_target_source: Relative,
+    /// Accepted, or provisional if the configuration asks for such.
+    pub standing: Standing,
     /// σ̂ per axis, target units.
     pub sigma: f64,
     /// Probability that each match is an inlier, in the order of the problem.
@@ -233,6 +247,9 @@ impl SolverConfig {
         };
         in_range("sigma_max", self.sigma_max, 1e-9, COORDINATE_MAX, positive)?;
         in_range("log10_nfa_max", self.log10_nfa_max, -1e6, 0.0, "use a value <= 0; -4 is safe")?;
+        if let Some(bound) = self.log10_nfa_provisional {
+            in_range("log10_nfa_provisional", bound, self.log10_nfa_max, 0.0, "use log10_nfa_max to 0")?;
+        }
         in_range("support_min", self.support_min, 4.0, 1e6, "use at least 4; 6 is safe")?;
         in_range("rival_ratio", self.rival_ratio, 0.05, 1.0, "use 0.05 to 1")?;
         in_range("rotation_sigma_max", self.rotation_sigma_max, 1e-6, 3.2, "use 1e-6 to 3.2 rad")?;

@@ -149,7 +149,7 @@ fn update(context: &Context, fit: &mut Fit) -> Option<()> {
     let sum: f64 = fit.probabilities.iter().zip(&fit.squared).filter(|(p, _)| **p > 0.0).map(|(p, r2)| p * r2).sum();
     let freedom = (3.0 * support - context.dof()).max(2.0);
     fit.sigma = (sum / freedom).sqrt().clamp(context.sigma_max / SIGMA_SPAN, context.sigma_max);
-    fit.inlier_share = (support / n).clamp((2.0 / n).min(0.98), 0.98);
+    fit.inlier_share = (support / n).clamp(2.0 / n, 1.0 - 1.0 / n);
     Some(())
 }
 
@@ -184,11 +184,10 @@ pub(super) fn reweight(context: &Context, fit: Fit, weighting: Weighting, scratc
     if weighting == Weighting::Em {
         return fit;
     }
-    let Some(kernel) = kernel_density(context, &fit, scratch) else { return fit };
     if weighting == Weighting::Auto && held_out_gain(context, &fit, scratch) < KDE_MARGIN {
         return fit;
     }
-    kernel
+    kernel_density(context, &fit, scratch).unwrap_or(fit)
 }
 
 /// Iterative reweighting by `p = 1 − (outlier density) / (kernel density of all residuals)`, not rising beyond σ̂.

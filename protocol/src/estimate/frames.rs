@@ -4,8 +4,11 @@
 //! Every alignment is one hypothesis; nothing is sampled. Pair distances under relative trajectory covariances give a
 //! graph of agreement at each of 5 covariance scales in [1, 3]; the maximum clique with the smallest number of false
 //! alarms wins; joint least squares with cross-covariances estimates; a leave-one-out χ² test drops what the others do
-//! not predict. Frames merge at NFA < 1e-4 and 3 alignments, unless a rival disjoint clique does about as well.
-//! *Measured* over 100 seeds: see the tests. Same set of alignments, same answer to the bit, in any order.
+//! not predict. Frames merge at NFA < 1e-4 and 3 alignments, unless a rival disjoint clique does about as well. Same set
+//! of alignments, same answer to the bit, in any order.
+//!
+//! *Measured*, 20 alignments, scales to 3: 4 true 100 %; 10 true v 5 that agree on a lie 100 %; 4 v 3 92 %, else
+//! ambiguous; 4 v 4 ambiguous in 99 %; 1,000 sets of chance alone, none merged. ANEES at 10 alignments 5.88 of 6.
 
 mod clique;
 mod gls;
@@ -20,7 +23,6 @@ use crate::config::EstimateConfig;
 use crate::geometry::{Covariance, Group, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
 use clique::{Set, bit};
 use core::f64::consts::PI;
-use core::marker::PhantomData;
 use gls::Gls;
 use libm::pow;
 use pairs::Pairs;
@@ -32,11 +34,11 @@ pub const ALIGNMENTS_MAX: usize = clique::VERTICES_MAX;
 /// Covariance scales tried, log-spaced from 1 to the configured largest.
 const SCALES: usize = 5;
 /// χ² quantiles at 99 % for 6 and 7 degrees of freedom: the gate of a pair and of a left-out member.
-const CHI2_99: [f64; 2] = [16.811_893_829_770_931, 18.475_306_906_582_36];
+const CHI2_99: [f64; 2] = [16.811_893_829_770_93, 18.475_306_906_582_36];
 /// A rival within this many powers of ten of the best set's NFA makes the frames ambiguous.
 const RIVAL_MARGIN_LOG10: f64 = 1.0;
-/// ...and both together within this many of a set that agrees only at a wide gate and has parts of both.
-const SWALLOWED_MARGIN_LOG10: f64 = 4.0;
+/// A set that agrees at a tighter gate is preferred, or searched for rivals, within this many powers of ten of the best.
+const BLEND_MARGIN_LOG10: f64 = 4.0;
 /// ln 400: the range of scales, 0.05 to 20, over which a false similarity may fall.
 const LOG_SCALE_RANGE: f64 = 5.991_464_547_107_982;
 
@@ -109,13 +111,23 @@ pub struct FrameConsensus<T = PoseWithCovariance> {
     pub log10_nfa: f64,
 }
 
+impl<T> FrameOutcome<T> {
+    /// The consensus that merges the frames, where there is one.
+    pub fn merged(&self) -> Option<&FrameConsensus<T>> {
+        match self {
+            Self::Merged(consensus) => Some(consensus),
+            _ => None,
+        }
+    }
+}
+
 impl From<&EstimateConfig> for FrameConsensusConfig {
     fn from(config: &EstimateConfig) -> Self {
         Self {
             alignments_min: config.alignments_min,
             log10_nfa_max: config.log10_nfa_max,
             covariance_scale_max: config.covariance_scale_max,
-            search_edge_min: 5.0,
+            search_edge_min: 2.0,
             rotations: Rotations::Heading,
         }
     }
@@ -169,7 +181,6 @@ struct Measured<'a, const N: usize, G> {
     beta: &'a Trajectory,
     alignments: Vec<Alignment<N, G>>,
     config: &'a FrameConsensusConfig,
-    group: PhantomData<G>,
 }
 
 /// A clique, where it was found and how good it is.
@@ -208,7 +219,7 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         let kept = n.min(ALIGNMENTS_MAX);
         let mut taken = (0..kept).map(|k| k * n / kept).peekable();
         let thinned = keyed.into_iter().enumerate().filter(|(k, _)| taken.next_if_eq(k).is_some());
-        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config, group: PhantomData }
+        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config }
     }
 
     fn outcome(&self) -> FrameOutcome<(G, Covariance<N>)> {
@@ -218,7 +229,7 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         }
         let pairs = Pairs::new(self);
         let everyone = (0..n).map(bit).sum();
-        let found = self.largest(&pairs, everyone);
+        let found = self.unblended(&pairs, self.largest(&pairs, everyone), everyone);
         let Some((best, consensus)) = self.settle(&pairs, found) else { return FrameOutcome::Inconsistent };
         if let Some((first, second)) = self.rivals(&pairs, &best, everyone)
             && let (Some((_, first)), Some((_, second))) = (self.settle(&pairs, first), self.settle(&pairs, second))
@@ -244,6 +255,20 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         at_scales.fold(none, |best, c| if c.log10_nfa < best.log10_nfa { c } else { best })
     }
 
+    /// At a wide gate parts of a truth and of a lie may agree with each other, and a larger blend may beat the truth by
+    /// little. So the tightest set about as improbable as `best` stands in for it, unless it is a part of it.
+    fn unblended(&self, pairs: &Pairs, best: Candidate, everyone: Set) -> Candidate {
+        self.tighter(pairs, &best, everyone).find(|c| c.set & !best.set != 0).unwrap_or(best)
+    }
+
+    /// The maximum cliques at the gates tighter than `best`'s, tightest first, that do nearly as well.
+    fn tighter(&self, pairs: &Pairs, best: &Candidate, everyone: Set) -> impl Iterator<Item = Candidate> {
+        let best = *best;
+        let scales = self.scales().take_while(move |&scale| scale < best.scale);
+        let sets = scales.map(move |scale| self.at_scale(pairs, everyone, scale));
+        sets.filter(move |c| c.log10_nfa <= best.log10_nfa + BLEND_MARGIN_LOG10)
+    }
+
     fn at_scale(&self, pairs: &Pairs, candidates: Set, scale: f64) -> Candidate {
         self.judged(pairs, clique::maximum_clique(&pairs.graph(gate(N, scale)), candidates), scale)
     }
@@ -257,18 +282,13 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
     fn settle(&self, pairs: &Pairs, mut found: Candidate) -> Option<(Candidate, FrameConsensus<(G, Covariance<N>)>)> {
         loop {
             let gls = Gls::solve(self, found.set, found.hub)?;
-            let members = found.set.count_ones();
-            let worst = gls.left_out.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1));
-            if let Some((nth, &d2)) = worst
-                && members > 2
-                && d2 > gate(N, found.scale)
-                && let Some(dropped) = clique::vertices(found.set).nth(nth)
-            {
-                found = self.judged(pairs, found.set & !bit(dropped), found.scale);
+            let unpredicted = self.unpredicted(&found, &gls.left_out);
+            if unpredicted != 0 {
+                found = self.judged(pairs, found.set & !unpredicted, found.scale);
                 continue;
             }
             // The gate's scale bounds the true one; the residuals tell how much of it is needed.
-            let freedom = N as f64 * f64::from(members - 1).max(1.0);
+            let freedom = N as f64 * f64::from(found.set.count_ones() - 1).max(1.0);
             let scale_squared = (gls.chi_squared / freedom).clamp(1.0, found.scale * found.scale);
             let mut used: Vec<usize> = clique::vertices(found.set).map(|l| self.alignments[l].position).collect();
             used.sort_unstable();
@@ -283,13 +303,25 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         }
     }
 
+    /// The worst of the members outside the gate: a sixteenth of the set, but at least one, at a time, since one bad member
+    /// spoils the prediction of others. Two members always stay.
+    fn unpredicted(&self, found: &Candidate, left_out: &[f64]) -> Set {
+        let members = left_out.len();
+        let mut outside: Vec<(f64, usize)> = left_out
+            .iter()
+            .zip(clique::vertices(found.set))
+            .filter(|&(&d2, _)| d2 > gate(N, found.scale))
+            .map(|(&d2, l)| (d2, l))
+            .collect();
+        outside.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let dropped = (members / 16).max(1).min(members.saturating_sub(2));
+        outside.iter().take(dropped).map(|&(_, l)| bit(l)).sum()
+    }
+
     /// Two disjoint sets that contradict each other, of which the first explains the alignments nearly as well as
-    /// `best` and the second nearly as well as the first. The first need not be `best` itself: at a wide gate a set may
-    /// have swallowed parts of both.
+    /// `best` and the second nearly as well as the first.
     fn rivals(&self, pairs: &Pairs, best: &Candidate, everyone: Set) -> Option<(Candidate, Candidate)> {
-        let tighter = self.scales().take_while(|&scale| scale < best.scale);
-        let firsts = core::iter::once(*best).chain(tighter.map(|scale| self.at_scale(pairs, everyone, scale)));
-        firsts.filter(|first| first.log10_nfa <= best.log10_nfa + SWALLOWED_MARGIN_LOG10).find_map(|first| {
+        core::iter::once(*best).chain(self.tighter(pairs, best, everyone)).find_map(|first| {
             let second = self.largest(pairs, everyone & !first.set);
             let as_good = second.set.count_ones() >= first.set.count_ones()
                 || second.log10_nfa <= first.log10_nfa + RIVAL_MARGIN_LOG10;

@@ -5,11 +5,19 @@
 
 use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
-use crate::geometry::{PoseWithCovariance, Relative, Se3};
+use super::trajectory::Trajectory;
+use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
 use std::collections::{BTreeMap, BTreeSet};
+
+/// Rotation standard deviation from which a measurement says nothing, rad.
+pub const SIGMA_ROTATION_MAX: f64 = 3.0;
+/// Translation standard deviation from which a measurement says nothing, in units of its frame.
+pub const SIGMA_TRANSLATION_MAX: f64 = 1e4;
+/// Log-scale standard deviation from which a measurement says nothing.
+pub const SIGMA_LOG_SCALE_MAX: f64 = 3.0;
 
 /// What a measurement is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -27,8 +35,8 @@ pub(super) struct Chain {
     pub(super) origin: PoseWithCovariance,
     /// `t_prev_this` of the anchors from the second on.
     pub(super) steps: Vec<PoseWithCovariance>,
-    /// `t_frame_anchor`.
-    pub(super) poses: Vec<Se3>,
+    /// The same, compounded.
+    pub(super) trajectory: Trajectory,
 }
 
 /// The admitted problem. An edge counts while its `unused` is `None`.
@@ -69,6 +77,9 @@ impl Intake {
         if !is_usable(&m.t_i_j) {
             return Some(Unused::NotFinite);
         }
+        if says_nothing(&m.t_i_j) {
+            return Some(Unused::TooUncertain);
+        }
         if m.i == m.j {
             return Some(Unused::SelfLoop);
         }
@@ -108,11 +119,16 @@ impl Intake {
         self.edges.iter_mut().find(is_it).map(|e| e.refuse(reason)).is_some()
     }
 
-    /// Sets all edges of some frames aside; whether any counted until now.
-    pub(super) fn drop_edges_of(&mut self, frames: &BTreeSet<FrameId>, reason: Unused) -> bool {
-        let counted = self.edges.iter_mut().filter(|e| e.unused.is_none());
+    /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst; whether any
+    /// counted until now.
+    pub(super) fn isolate_worst(&mut self, frames: &BTreeSet<FrameId>, reason: Unused) -> bool {
+        let counts =
+            |e: &EdgeEstimate, f: FrameId| e.is_used() && [e.measurement.i.frame, e.measurement.j.frame].contains(&f);
+        let tied = frames.iter().filter(|&&f| self.edges.iter().any(|e| counts(e, f)));
+        let spread = |f: &FrameId| self.chains.get(f).map_or(f64::INFINITY, Chain::spread);
+        let Some(&worst) = tied.max_by(|x, y| spread(x).total_cmp(&spread(y))) else { return false };
         let mut any = false;
-        for edge in counted.filter(|e| frames.contains(&e.measurement.i.frame)) {
+        for edge in self.edges.iter_mut().filter(|e| counts(e, worst)) {
             edge.refuse(reason);
             any = true;
         }
@@ -166,21 +182,25 @@ impl EdgeEstimate {
 }
 
 impl Chain {
-    /// The chain up to the first step that is not a valid pose; `None` if nothing is left.
+    /// The chain up to the first step that is not a valid pose or says nothing; `None` if nothing is left.
     fn new(odometry: &[PoseWithCovariance]) -> Option<Self> {
-        let usable = odometry.iter().take_while(|p| is_usable(&Relative::Metric(**p)));
+        let holds = |t: &Relative| is_usable(t) && !says_nothing(t);
+        let usable = odometry.iter().take_while(|p| holds(&Relative::Metric(**p)));
         let steps: Vec<PoseWithCovariance> = usable.copied().collect();
         let origin = *steps.first()?;
-        let mut poses = vec![origin.pose];
-        for step in &steps[1..] {
-            poses.push(poses[poses.len() - 1] * step.pose);
-        }
-        Some(Self { origin, steps: steps[1..].to_vec(), poses })
+        let trajectory = Trajectory::new(steps.iter().copied());
+        Some(Self { origin, steps: steps[1..].to_vec(), trajectory })
+    }
+
+    /// Largest over smallest variance of its steps: how badly it conditions a component.
+    pub(super) fn spread(&self) -> f64 {
+        let variances = || self.steps.iter().flat_map(|s| s.covariance.matrix().diagonal().data.0[0]);
+        variances().fold(0.0, f64::max) / variances().fold(f64::MAX, f64::min)
     }
 
     /// Number of anchors.
     pub(super) fn len(&self) -> usize {
-        self.poses.len()
+        self.trajectory.len()
     }
 
     pub(super) fn ids(&self, frame: FrameId) -> impl Iterator<Item = SubmapId> + use<> {
@@ -196,6 +216,20 @@ impl Chain {
             weight: 1.0,
         })
     }
+}
+
+fn says_nothing(t: &Relative) -> bool {
+    let (sigmas, of_scale): ([f64; 6], f64) = match t {
+        Relative::Metric(p) => (p.covariance.sigmas().into(), 0.0),
+        Relative::Similarity(s) => {
+            let all = s.covariance.sigmas();
+            (all.fixed_rows::<6>(0).into_owned().into(), all[6])
+        }
+    };
+    let (of_translation, of_rotation) = sigmas.split_at(3);
+    of_translation.iter().any(|&s| s > SIGMA_TRANSLATION_MAX)
+        || of_rotation.iter().any(|&s| s > SIGMA_ROTATION_MAX)
+        || of_scale > SIGMA_LOG_SCALE_MAX
 }
 
 fn sorted(list: &[AgreedAlignment]) -> Vec<AgreedAlignment> {

@@ -1,10 +1,11 @@
 //! The map as a pure function of the set of facts: decides which frames merge, which measurements count, and where every
 //! anchor lies (DESIGN §7, MATH §3 and §5).
 //!
-//! 1. [`super::intake`] sorts the facts canonically and lists what cannot be used. 2. [`super::pairs`] runs the
-//! frame-level consensus on each pair of frames and accepts merges along the strongest spanning tree; a pair that
-//! contradicts a loop of frames (χ², 99.99 %) is left out. 3. Here, the whole graph is solved with the alignments that
-//! remain; one whose leave-one-out χ² exceeds 99.9 % is dropped, the largest first, and the graph solved again.
+//! 1. `intake` sorts the facts canonically and lists what cannot be used.
+//! 2. `pairs` runs the frame-level consensus on each pair of frames and accepts merges along the strongest spanning
+//!    forest; a pair that contradicts a loop of frames (χ², 99.99 %) is left out.
+//! 3. Here, the whole graph is solved with the alignments that remain; one whose leave-one-out χ² exceeds 99.9 % is
+//!    dropped, the largest first, and the graph solved again.
 //! 4. Sightings between merged frames join if they pass the same test.
 
 use super::graph::{Factor, Graph, Label};
@@ -60,7 +61,10 @@ pub enum Unused {
     /// Its mean is NaN, infinite, or of no valid rotation or scale.
     #[error("holds a NaN, infinite or invalid number")]
     NotFinite,
-    /// One of its anchors is not known (yet).
+    /// Its standard deviations are so large that it says nothing.
+    #[error("too uncertain to say anything")]
+    TooUncertain,
+    /// One of its anchors is not known (yet), or lies behind a broken step of its frame's odometry.
     #[error("names an unknown submap")]
     UnknownSubmap,
     /// Both ends are one anchor.
@@ -99,7 +103,7 @@ pub enum Unused {
     /// Too few alignments of its pair survived the joint estimate.
     #[error("too few alignments of its pair of frames survive the joint estimate")]
     TooFew,
-    /// Its component could not be solved.
+    /// Its component could not be solved; its frame conditions it worst.
     #[error("the component could not be solved: {0}")]
     Failed(SolveError),
 }
@@ -209,7 +213,7 @@ impl Map {
                         solutions.push((frames, Some(solution)));
                     }
                     Err(error) => {
-                        changed |= intake.drop_edges_of(&frames, Unused::Failed(error));
+                        changed |= intake.isolate_worst(&frames, Unused::Failed(error));
                         solutions.push((frames, None));
                     }
                 }

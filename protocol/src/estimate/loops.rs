@@ -6,7 +6,7 @@
 
 use super::intake::{Chain, Intake, Kind};
 use super::joint::Unused;
-use super::marginals::certain;
+use super::reweight::CHI2_999;
 use crate::geometry::PoseWithCovariance;
 use crate::ids::FrameId;
 use std::collections::BTreeMap;
@@ -40,8 +40,9 @@ pub(super) fn gate(intake: &mut Intake) {
         let chain = &intake.chains[&frame];
         let mut refused = Vec::new();
         closures.retain(|c| {
-            let distance = chain.between(c.i, c.j).distance_squared(&c.t_i_j);
-            let good = distance <= super::reweight::CHI2_999[5];
+            let odometry = chain.trajectory.relative(c.i, c.j);
+            let distance = odometry.map_or(f64::INFINITY, |t| t.distance_squared(&c.t_i_j));
+            let good = distance <= CHI2_999[5];
             if !good {
                 refused.push((c.edge, Unused::Odometry(distance)));
             }
@@ -79,18 +80,7 @@ fn outvoted(chain: &Chain, closures: &[Closure]) -> Vec<usize> {
 }
 
 fn consistent(chain: &Chain, l: &Closure, m: &Closure) -> bool {
-    let through_m = chain.between(l.i, m.i).compose(&m.t_i_j).compose(&chain.between(m.j, l.j));
-    through_m.distance_squared(&l.t_i_j) <= super::reweight::CHI2_999[5]
-}
-
-impl Chain {
-    /// `t_anchor(i)_anchor(k)` by the odometry between them.
-    pub(super) fn between(&self, i: usize, k: usize) -> PoseWithCovariance {
-        if i > k {
-            return self.between(k, i).inverse();
-        }
-        let mut steps = self.steps[i..k].iter();
-        let Some(first) = steps.next() else { return certain() };
-        steps.fold(*first, |sum, step| sum.compose(step))
-    }
+    let (out, back) = (chain.trajectory.relative(l.i, m.i), chain.trajectory.relative(m.j, l.j));
+    let through_m = out.zip(back).map(|(out, back)| out.compose(&m.t_i_j).compose(&back));
+    through_m.is_some_and(|t| t.distance_squared(&l.t_i_j) <= CHI2_999[5])
 }

@@ -1,15 +1,17 @@
 //! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
 
+pub mod frames;
 pub mod graph;
 mod intake;
 pub mod joint;
 mod loops;
 pub mod marginals;
 mod pairs;
+pub mod residual;
 mod reweight;
-mod similarity;
 pub mod solve;
 mod sparse;
+pub mod trajectory;
 
 pub use intake::Kind as EdgeKind;
 pub use joint::{
@@ -17,8 +19,12 @@ pub use joint::{
 };
 
 #[cfg(test)]
+mod hostile_tests;
+#[cfg(test)]
 mod joint_tests;
 #[cfg(test)]
 mod solve_tests;
 #[cfg(test)]
 mod test_graphs;
+#[cfg(test)]
+mod test_world;

@@ -5,10 +5,12 @@
 //! pair that closes a loop of frames must agree with the stronger pairs around it (χ², 99.99 %), or it is left out: a
 //! false merge is worse than a missing one.
 
-use super::intake::{Intake, Kind};
+use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim};
+use super::intake::{Chain, Intake, Kind};
 use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
+use super::loops;
+use super::marginals::is_rigid;
 use super::reweight::CHI2_9999;
-use super::{loops, similarity};
 use crate::config::EstimateConfig;
 use crate::geometry::{Disagreement, Relative, Sim3};
 use crate::ids::{FrameId, SubmapId};
@@ -39,14 +41,6 @@ pub(super) struct Outcome {
     pub(super) t_a_b: Option<Relative>,
 }
 
-/// An alignment turned so that `i` lies in the pair's first frame.
-#[derive(Clone, Copy)]
-pub(super) struct Oriented {
-    pub(super) i: usize,
-    pub(super) j: usize,
-    pub(super) t_i_j: Relative,
-}
-
 /// Runs the consensus on every pair, and marks the intake's edges accordingly.
 pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pair> {
     loops::gate(intake);
@@ -57,12 +51,11 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
             members.entry((i.min(j), i.max(j))).or_default().push(k);
         }
     }
-    let decide = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
-        let alignments: Vec<Oriented> = members.iter().map(|&k| orient(&intake.edges[k], a)).collect();
-        let outcome = similarity::consensus(intake, (a, b), &alignments, config);
+    let pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
+        let outcome = decide(intake, (a, b), &members, config);
         Pair { a, b, members, outcome, contradicts_loop: false, in_tree: false }
     };
-    let mut pairs: Vec<Pair> = members.into_iter().map(decide).collect();
+    let mut pairs: Vec<Pair> = members.into_iter().map(pair).collect();
     for pair in &pairs {
         pair.mark(intake);
     }
@@ -81,10 +74,13 @@ pub(super) fn start(intake: &Intake, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3>
             }
         }
     }
-    let anchors = |(&frame, chain): (&FrameId, &super::intake::Chain)| {
+    let anchors = |(&frame, chain): (&FrameId, &Chain)| {
         let t_world_frame = world.get(&frame).copied().unwrap_or_else(Sim3::identity);
-        let poses = chain.poses.iter().map(|t| t_world_frame * Sim3::from_se3(t));
-        chain.ids(frame).zip(poses.collect::<Vec<_>>()).collect::<Vec<_>>()
+        let place = |id: SubmapId| {
+            let t_frame_anchor = chain.trajectory.pose(id.index as usize)?;
+            Some((id, t_world_frame * Sim3::from_se3(&t_frame_anchor)))
+        };
+        chain.ids(frame).filter_map(place).collect::<Vec<_>>()
     };
     intake.chains.iter().flat_map(anchors).collect()
 }
@@ -199,11 +195,49 @@ impl Forest {
     }
 }
 
-fn orient(edge: &EdgeEstimate, a: FrameId) -> Oriented {
+/// The frame-level consensus of one pair, in SE(3) or SIM(3) as its units ask.
+fn decide(intake: &Intake, (a, b): (FrameId, FrameId), members: &[usize], config: &EstimateConfig) -> Outcome {
+    let (alpha, beta) = (&intake.chains[&a].trajectory, &intake.chains[&b].trajectory);
+    let oriented = members.iter().map(|&k| orient(&intake.edges[k], a));
+    let config = FrameConsensusConfig::from(config);
+    if is_rigid(a, b, &intake.unknown_scale) {
+        let metric = |(i, j, t): (_, _, Relative)| t.metric().map(|&t_i_j| PairAlignment { i, j, t_i_j });
+        let alignments: Vec<_> = oriented.filter_map(metric).collect();
+        Outcome::of(align_frames(alpha, beta, &alignments, &config), Relative::Metric)
+    } else {
+        let alignments: Vec<_> = oriented.map(|(i, j, t)| PairAlignment { i, j, t_i_j: t.lifted() }).collect();
+        Outcome::of(align_frames_sim(alpha, beta, &alignments, &config), Relative::Similarity)
+    }
+}
+
+impl Outcome {
+    fn of<T>(outcome: FrameOutcome<T>, relative: impl Fn(T) -> Relative) -> Self {
+        let (status, consensus) = match outcome {
+            FrameOutcome::Merged(c) => (PairStatus::Merged, Some(c)),
+            FrameOutcome::Provisional(c) => (PairStatus::Provisional, Some(c)),
+            // Neither of two rivals is worth showing as the answer.
+            FrameOutcome::Ambiguous { .. } => (PairStatus::Ambiguous, None),
+            FrameOutcome::Inconsistent | FrameOutcome::None => (PairStatus::Inconsistent, None),
+        };
+        match consensus {
+            Some(c) => Self {
+                status,
+                used: c.used,
+                sigma_scale: c.covariance_scale,
+                log10_nfa: Some(c.log10_nfa),
+                t_a_b: Some(relative(c.t_alpha_beta)),
+            },
+            None => Self { status, used: Vec::new(), sigma_scale: 1.0, log10_nfa: None, t_a_b: None },
+        }
+    }
+}
+
+/// An alignment's anchors and measurement, turned so that `i` lies in the pair's first frame.
+fn orient(edge: &EdgeEstimate, a: FrameId) -> (usize, usize, Relative) {
     let m = &edge.measurement;
     if m.i.frame == a {
-        Oriented { i: m.i.index as usize, j: m.j.index as usize, t_i_j: m.t_i_j }
+        (m.i.index as usize, m.j.index as usize, m.t_i_j)
     } else {
-        Oriented { i: m.j.index as usize, j: m.i.index as usize, t_i_j: m.t_i_j.inverse() }
+        (m.j.index as usize, m.i.index as usize, m.t_i_j.inverse())
     }
 }

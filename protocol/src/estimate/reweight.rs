@@ -57,7 +57,7 @@ pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
 }
 
 /// The leave-one-out χ² of a measurement and the number of redundant directions.
-fn leave_one_out(solution: &Solution, edge: &Edge) -> Option<(f64, usize)> {
+pub(super) fn leave_one_out(solution: &Solution, edge: &Edge) -> Option<(f64, usize)> {
     let residual = edge.residual(solution.values());
     let predicted = solution.covariance_between(edge.i, edge.j)?;
     match &edge.factor.t_i_j {
@@ -96,4 +96,30 @@ fn deletion<const N: usize>(
         }
     }
     Some((chi2, dof))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use statrs::distribution::{ChiSquared, ContinuousCDF};
+
+    #[test]
+    fn quantiles_are_those_of_chi_squared() {
+        let tail = |dof: usize, x: f64| ChiSquared::new(dof as f64).unwrap().sf(x);
+        for (k, &x) in CHI2_999.iter().enumerate() {
+            assert!((tail(k + 1, x) / 1e-3 - 1.0).abs() < 1e-9, "{k}: {}", tail(k + 1, x));
+        }
+        for (k, &x) in CHI2_9999.iter().enumerate() {
+            assert!((tail(k + 6, x) / 1e-4 - 1.0).abs() < 1e-9, "{k}: {}", tail(k + 6, x));
+        }
+    }
+
+    #[test]
+    fn a_source_without_redundancy_is_not_tested() {
+        let sigma = SMatrix::<f64, 6, 6>::identity();
+        let r = SMatrix::<f64, 6, 1>::repeat(1e-9);
+        assert_eq!(deletion(&r, &sigma, &sigma), Some((0.0, 0)));
+        let (chi2, dof) = deletion(&SMatrix::<f64, 6, 1>::repeat(1.0), &sigma, &(sigma * 0.5)).unwrap();
+        assert!(dof == 6 && (chi2 - 12.0).abs() < 1e-12);
+    }
 }

@@ -10,7 +10,11 @@ const SEEDS: u64 = 100;
 /// How often each outcome came, over seeded worlds.
 #[derive(Debug, Default)]
 struct Tally {
+    /// Merged within 8° and 3 m of the truth.
     right: u32,
+    /// Merged on true alignments alone, too few or too close together to come that near.
+    weak: u32,
+    /// Merged, and neither.
     wrong: u32,
     provisional: u32,
     ambiguous: u32,
@@ -28,6 +32,7 @@ fn tally(draw: Draw, config: &FrameConsensusConfig) -> Tally {
         let w = World::new(7000 + seed, draw);
         match align_frames(&w.alpha, &w.beta, &w.alignments, config) {
             FrameOutcome::Merged(c) if w.is_right(&c.t_alpha_beta.pose) => tally.right += 1,
+            FrameOutcome::Merged(c) if c.used.iter().all(|&k| w.real[k]) => tally.weak += 1,
             FrameOutcome::Merged(_) => tally.wrong += 1,
             FrameOutcome::Provisional(_) => tally.provisional += 1,
             FrameOutcome::Ambiguous { .. } => tally.ambiguous += 1,
@@ -35,7 +40,7 @@ fn tally(draw: Draw, config: &FrameConsensusConfig) -> Tally {
             FrameOutcome::None => tally.none += 1,
         }
     }
-    println!("{} true, {} aliased, {} random: {tally:?}", draw.real, draw.aliased, draw.random);
+    println!("{draw:?}, scales to {}: {tally:?}", config.covariance_scale_max);
     tally
 }
 
@@ -66,7 +71,7 @@ fn ten_true_beat_five_that_agree_on_a_lie() {
 #[test]
 fn four_true_never_lose_to_three_that_agree_on_a_lie() {
     let t = tally(draw(4, 3, 13), &config(3.0));
-    assert!(t.right >= 85 && t.wrong == 0 && t.right + t.ambiguous == 100, "{t:?}");
+    assert!(t.right >= 85 && t.wrong == 0 && t.right + t.ambiguous + t.weak == 100, "{t:?}");
 }
 
 #[test]
@@ -78,14 +83,27 @@ fn equal_rivals_are_ambiguous() {
 #[test]
 fn alignments_three_times_noisier_than_they_say_still_merge() {
     let t = tally(Draw { under_reported: 3.0, ..draw(4, 0, 16) }, &config(3.0));
-    assert!(t.right >= 90 && t.wrong <= 1, "{t:?}");
+    assert!(t.right >= 90 && t.wrong == 0, "{t:?}");
 }
 
 #[test]
 fn chance_alone_never_merges() {
     for random in [5, 20, 60] {
         let t = tally(draw(0, 0, random), &config(3.0));
-        assert_eq!((t.right + t.wrong, t.ambiguous), (0, 0), "{t:?}");
+        assert_eq!((t.right + t.weak + t.wrong, t.ambiguous), (0, 0), "{t:?}");
+    }
+}
+
+#[test]
+fn blends_of_truth_and_lie_never_merge() {
+    // Seeds of which four merged a blend of three true and three aliased alignments before tighter sets were preferred.
+    for d in [draw(4, 3, 13), draw(5, 4, 11)] {
+        for seed in 700_000..700_300 {
+            let w = World::new(seed, d);
+            if let FrameOutcome::Merged(c) = align_frames(&w.alpha, &w.beta, &w.alignments, &config(3.0)) {
+                assert!(w.is_right(&c.t_alpha_beta.pose), "seed {seed}: {c:?}");
+            }
+        }
     }
 }
 
@@ -121,6 +139,32 @@ fn the_covariance_is_honest() {
     println!("ANEES {anees:.3}, {:.1} % inside the 95 % ellipsoid", 100.0 * inside);
     assert!((5.6 * 0.95..6.4 * 1.1).contains(&anees), "ANEES {anees}");
     assert!((0.92..0.98).contains(&inside), "{inside} inside the 95 % ellipsoid");
+}
+
+#[test]
+fn swapped_frames_give_the_inverse() {
+    for seed in 0..20 {
+        let w = World::new(25_000 + seed, draw(6, 0, 10));
+        let swapped: Vec<PairAlignment> =
+            w.alignments.iter().map(|a| PairAlignment { i: a.j, j: a.i, t_i_j: a.t_i_j.inverse() }).collect();
+        let there = align_frames(&w.alpha, &w.beta, &w.alignments, &config(3.0));
+        let back = align_frames(&w.beta, &w.alpha, &swapped, &config(3.0));
+        let (FrameOutcome::Merged(there), FrameOutcome::Merged(back)) = (there, back) else { panic!("seed {seed}") };
+        assert_eq!(there.used, back.used);
+        // The residuals are the same up to Ad(T_ij); linearisation alone differs, by less than a fifth of a standard
+        // deviation (measured: median a hundredth, worst a tenth).
+        let error = there.t_alpha_beta.pose.local(&back.t_alpha_beta.pose.inverse());
+        let d2 = there.t_alpha_beta.covariance.mahalanobis_squared(&error);
+        assert!(d2 < 0.04, "seed {seed}: d² {d2}");
+    }
+}
+
+#[test]
+fn the_gates_are_the_chi_squared_quantiles() {
+    use statrs::distribution::{ChiSquared, ContinuousCDF};
+    for (freedom, quantile) in [6.0, 7.0].into_iter().zip(CHI2_99) {
+        assert!((ChiSquared::new(freedom).unwrap().cdf(quantile) - 0.99).abs() < 1e-12);
+    }
 }
 
 #[test]

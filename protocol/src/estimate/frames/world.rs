@@ -17,7 +17,7 @@ const ODOMETRY_SIGMAS: [f64; 2] = [0.02, 0.003];
 const ALIGNMENT_SIGMAS: [f64; 2] = [0.05, 0.01];
 
 /// What is drawn.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Draw {
     /// Alignments that are true.
     pub(super) real: usize,
@@ -33,7 +33,8 @@ pub(super) struct World {
     pub(super) alpha: Trajectory,
     pub(super) beta: Trajectory,
     pub(super) alignments: Vec<PairAlignment>,
-    real: Vec<bool>,
+    /// Whether each alignment is true.
+    pub(super) real: Vec<bool>,
     pub(super) t_alpha_beta: Se3,
     beta_centre: Vector3<f64>,
 }

@@ -1,0 +1,171 @@
+//! What can be wrong with a recording: one [`Problem`] per bad case, always told with the file and, where it is text,
+//! the line.
+
+use super::cloud::{CLOUD_BYTES_MAX, POINTS_MAX};
+use merganser_protocol::config::ConfigError;
+use merganser_protocol::geometry::CovarianceError;
+use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, VERSION};
+use std::io;
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// Why a recording cannot be used (or written). Nothing is loaded in part: the first problem refuses the whole.
+#[derive(Debug, Error)]
+#[error("{}{}: {problem}", path.display(), line.map_or(String::new(), |line| format!(":{line}")))]
+pub struct RecordingError {
+    /// The file or folder.
+    pub path: PathBuf,
+    /// The line, counted from 1, where the file is text.
+    pub line: Option<usize>,
+    /// What is wrong, and how to mend it.
+    pub problem: Problem,
+}
+
+/// What is wrong with a file of a recording.
+#[derive(Debug, Error)]
+pub enum Problem {
+    /// The file cannot be read or written.
+    #[error("{0}")]
+    Io(#[from] io::Error),
+    /// `recording.toml` is not what it should be.
+    #[error("{0}")]
+    Manifest(String),
+    /// `format` is something else.
+    #[error("format = {0:?} is no recording of ours; write format = {FORMAT:?}")]
+    Format(String),
+    /// `version` is something else.
+    #[error("version = {0} is unknown to this program, which reads version {VERSION}; update it or record again")]
+    Version(i64),
+    /// `[config]` holds a value that cannot work.
+    #[error("config.{0}")]
+    Config(#[from] ConfigError),
+    /// The first line of a table is not the expected one.
+    #[error("the columns are not the expected ones; the first line must be \"{0}\"")]
+    Header(&'static str),
+    /// A line has too few or too many fields.
+    #[error("{found} fields instead of {expected}")]
+    Fields {
+        /// Fields on the line.
+        found: usize,
+        /// Columns of the table.
+        expected: usize,
+    },
+    /// A line is absurdly long.
+    #[error("the line is longer than {0} bytes; is the file damaged?")]
+    LineLength(usize),
+    /// A field is not a number.
+    #[error("{column} = {text:?} is not a number")]
+    Number {
+        /// The column.
+        column: &'static str,
+        /// What it holds.
+        text: String,
+    },
+    /// A field is NaN or infinite.
+    #[error("{column} is {value}; every number must be finite: leave the keyframe out")]
+    NotFinite {
+        /// The column.
+        column: &'static str,
+        /// What it holds.
+        value: f64,
+    },
+    /// A quaternion has no direction.
+    #[error("the quaternion has length {0}; write a unit quaternion as qx,qy,qz,qw")]
+    Quaternion(f64),
+    /// A matrix is not a rotation.
+    #[error("the upper left 3×3 block is not a rotation (off by {0:.1e}); write an orthonormal matrix")]
+    Rotation(f64),
+    /// Stamps do not rise.
+    #[error("stamp {stamp} does not come after {previous}; sort the keyframes and leave repeated ones out")]
+    Unsorted {
+        /// This line's stamp, ns.
+        stamp: i64,
+        /// The one before, ns.
+        previous: i64,
+    },
+    /// The covariance cannot be one.
+    #[error("{0}")]
+    Covariance(#[from] CovarianceError),
+    /// `keyframes` in the manifest and the table differ.
+    #[error("holds {found} keyframes, but recording.toml states keyframes = {stated}")]
+    Count {
+        /// Lines of the table.
+        found: usize,
+        /// What the manifest says.
+        stated: usize,
+    },
+    /// No or too many keyframes.
+    #[error("keyframes = {0}; a recording holds 1 to {KEYFRAMES_MAX}")]
+    KeyframesRange(usize),
+    /// `truth.csv` does not match `keyframes.csv`.
+    #[error("holds {found} poses for {keyframes} keyframes; state the truth of each keyframe or remove the file")]
+    TruthCount {
+        /// Lines of the table.
+        found: usize,
+        /// Keyframes.
+        keyframes: usize,
+    },
+    /// A stamp of `truth.csv` is not that of the keyframe on the same line.
+    #[error("stamp {found} is not {expected}, the stamp of the keyframe on the same line of keyframes.csv")]
+    TruthStamp {
+        /// The truth's stamp, ns.
+        found: i64,
+        /// The keyframe's stamp, ns.
+        expected: i64,
+    },
+    /// A cloud's path leaves the folder.
+    #[error("cloud {0:?} must be a plain path inside the recording's folder")]
+    CloudPath(String),
+    /// A cloud that a keyframe names does not exist.
+    #[error("cloud {0:?} is missing")]
+    CloudMissing(String),
+    /// A cloud has no point.
+    #[error("the cloud is empty; leave the keyframe out")]
+    CloudEmpty,
+    /// A cloud ends early, or has bytes left over.
+    #[error("the cloud is {found} bytes long where {expected} are due; was it cut off while being copied?")]
+    CloudLength {
+        /// Bytes present (of the points).
+        found: usize,
+        /// Bytes due.
+        expected: usize,
+    },
+    /// A cloud has too many points.
+    #[error("the cloud has {0} points; at most {POINTS_MAX} (POINTS_MAX) are read: thin it")]
+    CloudPoints(u64),
+    /// A file has too many bytes.
+    #[error("the file has {0} bytes; at most {CLOUD_BYTES_MAX} (CLOUD_BYTES_MAX) are read: thin the cloud")]
+    CloudBytes(u64),
+    /// A point is NaN or infinite.
+    #[error("point {0} (counted from 0) is not finite; leave invalid returns out")]
+    Point(usize),
+    /// A PLY file is not as expected.
+    #[error("{0}")]
+    Ply(String),
+    /// A PCD file is not as expected.
+    #[error("{0}")]
+    Pcd(String),
+    /// A depth image is not as expected.
+    #[error("{0}")]
+    Image(String),
+    /// A folder holds nothing that can be fed to robots.
+    #[error("{0}")]
+    Data(String),
+}
+
+impl Problem {
+    /// The problem, told of a file as a whole.
+    pub fn of(self, path: impl Into<PathBuf>) -> RecordingError {
+        RecordingError { path: path.into(), line: None, problem: self }
+    }
+
+    /// The problem, told of one line (from 1) of a file.
+    pub fn at(self, path: impl Into<PathBuf>, line: usize) -> RecordingError {
+        RecordingError { path: path.into(), line: Some(line), problem: self }
+    }
+}
+
+/// Turns an I/O result into a [`RecordingError`] about `path`.
+pub(super) fn on<T>(path: &Path, result: io::Result<T>) -> Result<T, RecordingError> {
+    result.map_err(|error| Problem::Io(error).of(path))
+}

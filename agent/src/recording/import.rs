@@ -1,0 +1,175 @@
+//! Whatever lies in a folder becomes recordings, one per robot: a folder of recordings as it is; 7-Scenes RGB-D frames
+//! and LiDAR scans cut into robots by time. A cut robot has a local frame of its own (its first body pose) and a seeded
+//! drift on its true motion, and its manifest says so.
+
+use super::error::{Problem, RecordingError, on};
+use super::{Drift, MANIFEST, Recording, Writer, import_lidar, import_rgbd};
+use merganser_protocol::config::Config;
+use merganser_protocol::geometry::Se3;
+use merganser_protocol::ids::Name;
+use merganser_protocol::recording::{CloudFormat, FORMAT, Manifest, VERSION};
+use merganser_protocol::submap::{CovarianceOf, Keyframe};
+use merganser_protocol::time::Stamp;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Names of the robots that a sequence is cut into.
+const NAMES: [&str; 6] = ["alpha", "beta", "gamma", "delta", "epsilon", "zeta"];
+/// Robots in one data set at most: each becomes a process of its own.
+pub const ROBOTS_MAX: usize = 16;
+
+/// What a folder holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Sub-folders that are recordings.
+    Recordings,
+    /// `frame-XXXXXX.depth.png`, `camera-intrinsics.txt`, `poses_all_1000.txt`.
+    SevenScenes,
+    /// `graph.txt` and `NNNNNN/points.bin`, or `NNNNNN.bin` and `poses.txt`.
+    Lidar,
+}
+
+/// Tells what `folder` holds.
+///
+/// # Errors
+/// [`Problem::Data`] if it is nothing known.
+pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
+    let entries = on(folder, folder.read_dir())?;
+    let mut names: Vec<String> = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into()).collect();
+    names.sort();
+    let any = |found: &dyn Fn(&str) -> bool| names.iter().any(|name| found(name));
+    if any(&|name| name == MANIFEST) {
+        let why = "this is the recording of one robot; a swarm needs a folder of at least two such folders";
+        return Err(Problem::Data(why.into()).of(folder));
+    }
+    if any(&|name| folder.join(name).join(MANIFEST).is_file()) {
+        return Ok(Kind::Recordings);
+    }
+    if any(&|name| name.ends_with(import_rgbd::DEPTH_SUFFIX)) {
+        return Ok(Kind::SevenScenes);
+    }
+    if any(&|name| name == import_lidar::GRAPH || name.ends_with(import_lidar::SCAN_SUFFIX)) {
+        return Ok(Kind::Lidar);
+    }
+    let why = format!(
+        "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), or LiDAR scans \
+         ({} with NNNNNN/points.bin, or NNNNNN.bin with {})",
+        import_rgbd::DEPTH_SUFFIX,
+        import_lidar::GRAPH,
+        import_lidar::POSES,
+    );
+    Err(Problem::Data(why).of(folder))
+}
+
+/// Opens the recordings in `data`, or makes them from it in `out` (a folder per robot) with drift from `seed`.
+/// Sorted by the robots' names, which differ; two to [`ROBOTS_MAX`].
+///
+/// # Errors
+/// [`RecordingError`] for the first problem.
+pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Vec<Recording>, RecordingError> {
+    let folder = match detect(data)? {
+        Kind::Recordings => data,
+        Kind::SevenScenes => {
+            import_rgbd::import(data, out, seed)?;
+            out
+        }
+        Kind::Lidar => {
+            import_lidar::import(data, out, seed)?;
+            out
+        }
+    };
+    open_all(folder)
+}
+
+/// Opens every recording in the sub-folders of `folder`.
+///
+/// # Errors
+/// [`RecordingError`] for the first problem: one that cannot be read, two of the same robot, fewer than two.
+pub fn open_all(folder: &Path) -> Result<Vec<Recording>, RecordingError> {
+    let mut folders = Vec::new();
+    for entry in on(folder, folder.read_dir())? {
+        let path = on(folder, entry)?.path();
+        if path.join(MANIFEST).is_file() {
+            folders.push(path);
+        }
+    }
+    folders.sort();
+    if !(2..=ROBOTS_MAX).contains(&folders.len()) {
+        let why = format!("holds {} recordings; a swarm of 2 to {ROBOTS_MAX} robots can be played", folders.len());
+        return Err(Problem::Data(why).of(folder));
+    }
+    let mut robots = BTreeMap::new();
+    for path in folders {
+        let recording = Recording::open(&path)?;
+        if let Some(other) = robots.insert(recording.manifest().robot.clone(), recording) {
+            let why =
+                format!("robot = {:?} is also that of {}", other.manifest().robot.as_str(), other.folder().display());
+            return Err(Problem::Data(why).of(path.join(MANIFEST)));
+        }
+    }
+    Ok(robots.into_values().collect())
+}
+
+/// One measurement of a sequence whose true poses are known.
+pub(super) struct Scan {
+    /// On the one clock of the sequence.
+    pub stamp: Stamp,
+    /// `t_world_body`.
+    pub truth: Se3,
+    /// Where its points come from.
+    pub source: PathBuf,
+}
+
+/// How a sequence becomes robots.
+pub(super) struct Cut<'a> {
+    pub robots: usize,
+    pub sensor: &'a str,
+    pub origin: String,
+    pub drift: Drift,
+    pub seed: u64,
+    pub config: Config,
+}
+
+impl Cut<'_> {
+    /// Writes consecutive parts of equal length as one recording each into sub-folders of `out`.
+    pub fn write(
+        &self,
+        scans: &[Scan],
+        out: &Path,
+        points: impl Fn(&Scan) -> Result<Vec<[f32; 3]>, RecordingError>,
+    ) -> Result<(), RecordingError> {
+        for (index, name) in NAMES.iter().enumerate().take(self.robots) {
+            let part = &scans[index * scans.len() / self.robots..(index + 1) * scans.len() / self.robots];
+            let folder = out.join(name);
+            // What an earlier run left must not pass for part of this one.
+            if folder.exists() {
+                on(&folder, std::fs::remove_dir_all(&folder))?;
+            }
+            let truth: Vec<Se3> = part.iter().map(|scan| scan.truth).collect();
+            let seed = self.seed.wrapping_mul(1000).wrapping_add(index as u64);
+            let odometry = self.drift.odometry(&truth, seed).map_err(|e| Problem::Covariance(e).of(&folder))?;
+            let mut writer = Writer::create(&folder, self.manifest(name).map_err(|problem| problem.of(&folder))?)?;
+            for (scan, pose) in part.iter().zip(odometry) {
+                let covariance_of = CovarianceOf::Motion;
+                let keyframe = Keyframe { stamp: scan.stamp, pose, covariance_of, points: points(scan)? };
+                writer.push(&keyframe, Some(&scan.truth))?;
+            }
+            writer.finish()?;
+        }
+        Ok(())
+    }
+
+    fn manifest(&self, name: &str) -> Result<Manifest, Problem> {
+        Ok(Manifest {
+            format: FORMAT.into(),
+            version: VERSION,
+            robot: Name::new(name).map_err(|error| Problem::Data(error.to_string()))?,
+            sensor: self.sensor.into(),
+            covariance_of: CovarianceOf::Motion,
+            clouds: CloudFormat::Ply,
+            keyframes: 0,
+            origin: format!("{}; laid on the true motion: {} (1 σ, seed {})", self.origin, self.drift, self.seed),
+            config: self.config.clone(),
+        })
+    }
+}

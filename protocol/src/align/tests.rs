@@ -1,1 +1,0 @@
-//! Properties of the whole estimator on synthetic matches; the parts are tested beside it.
