@@ -30,8 +30,8 @@ pub trait Core: Sized {
     fn frame(&self) -> FrameId;
     /// Digest of the set of entries it holds.
     fn digest(&self) -> Hash;
-    /// What it believes.
-    fn snapshot(&mut self, now: Instant) -> Option<Snapshot>;
+    /// What it believes; fakes have nothing to show.
+    fn snapshot(&self, now: Instant) -> Option<Snapshot>;
 }
 
 impl Core for Agent {
@@ -65,7 +65,7 @@ impl Core for Agent {
         Self::digest(self)
     }
 
-    fn snapshot(&mut self, _now: Instant) -> Option<Snapshot> {
-        None
+    fn snapshot(&self, now: Instant) -> Option<Snapshot> {
+        Some(Self::snapshot(self, now))
     }
 }

@@ -160,7 +160,7 @@ impl Core for Fake {
         Hash::of(&self.entries.values().flatten().copied().collect::<Vec<u8>>())
     }
 
-    fn snapshot(&mut self, _now: Instant) -> Option<Snapshot> {
+    fn snapshot(&self, _now: Instant) -> Option<Snapshot> {
         None
     }
 }

@@ -413,13 +413,13 @@ impl<C: Core> Swarm<C> {
         self.queue.push(now.after(millis(1000.0)), Event::Sample);
     }
 
-    fn robot_samples(&mut self, now: Instant) -> Vec<RobotSample> {
-        let sample = |robot: &mut Robot<C>| {
+    fn robot_samples(&self, now: Instant) -> Vec<RobotSample> {
+        let sample = |robot: &Robot<C>| {
             let local = robot.local(now);
-            let core = robot.core.as_mut()?;
+            let core = robot.core.as_ref()?;
             Some(RobotSample { name: robot.name.to_string(), digest: core.digest(), snapshot: core.snapshot(local) })
         };
-        self.robots.iter_mut().filter_map(sample).collect()
+        self.robots.iter().filter_map(sample).collect()
     }
 
     fn see(&mut self, robot: usize, seen: &Seen<'_>) {
