@@ -4,6 +4,7 @@
 use crate::commands::{check, keys, replay, run, watch};
 use crate::config::FileConfigError;
 use crate::demo::{self, DemoArgs};
+use crate::host::HostError;
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 use std::ffi::OsString;
@@ -57,7 +58,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Err(error) if is_closed_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             let _ = console::Term::stderr().write_line(&format!("merganser: {}", explain(&error)));
-            ExitCode::from(if error.downcast_ref::<FileConfigError>().is_some() { 2 } else { 1 })
+            ExitCode::from(if is_misconfigured(&error) { 2 } else { 1 })
         }
     }
 }
@@ -80,6 +81,11 @@ fn explain(error: &anyhow::Error) -> String {
         line if line.contains(&cause) => line,
         line => format!("{line}: {cause}"),
     })
+}
+
+fn is_misconfigured(error: &anyhow::Error) -> bool {
+    let host = error.downcast_ref::<HostError>();
+    error.downcast_ref::<FileConfigError>().is_some() || matches!(host, Some(HostError::Config(_)))
 }
 
 /// Whoever read our output has enough of it: `merganser watch --json | head`.

@@ -6,6 +6,7 @@ pub mod commands;
 pub mod config;
 pub mod demo;
 pub mod driver;
+pub mod host;
 pub mod journal;
 pub mod keys;
 pub mod link;

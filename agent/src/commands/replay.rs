@@ -3,7 +3,7 @@
 
 use super::say;
 use crate::config::FileConfig;
-use crate::driver::{Core, Finished};
+use crate::driver::Finished;
 use crate::journal::{Frame, Reader, Replayed, Start};
 use anyhow::{Context, Result, bail, ensure};
 use merganser_protocol::agent::io::{Input, JobId, Output};

@@ -2,20 +2,16 @@
 
 use super::{runtime, say};
 use crate::config::FileConfig;
-use crate::driver::{Clock, Driver, Finished, Parts};
-use crate::journal::{self, Start, StoredRecord};
-use crate::link::Link;
-use crate::queue::{Drops, Inbox, queue};
-use crate::store::{self, Store};
+use crate::driver::Finished;
+use crate::host::{Host, Options};
+use crate::queue::{Drops, Inbox};
+use crate::recording::Recording;
 use crate::telemetry;
 use anyhow::{Context, Result};
-use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::{Command, Input};
-use merganser_protocol::submap::Keyframe;
 use merganser_protocol::time::Stamp;
-use rand::TryRng;
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
@@ -64,7 +60,7 @@ fn speed(text: &str) -> Result<f64, String> {
 pub fn run(args: &RunArgs) -> Result<bool> {
     let config = FileConfig::load(&args.config)?;
     telemetry::init(&config.log);
-    let recording = args.recording.as_ref().map(|folder| Recorded::open(folder)).transpose()?;
+    let recording = args.recording.as_ref().map(|folder| Recording::open(folder)).transpose()?;
     let runtime = runtime()?;
     let finished = runtime.block_on(live(args, config, recording));
     runtime.shutdown_timeout(Duration::from_millis(200)); // a job that still runs is of no use any more
@@ -73,78 +69,32 @@ pub fn run(args: &RunArgs) -> Result<bool> {
     Ok(true)
 }
 
-async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recorded>) -> Result<Finished> {
+async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recording>) -> Result<Finished> {
     let stop = stop_signal()?;
     if let Some(recording) = &recording {
         suit(&mut config, recording);
     }
-    let clock = Clock::start();
-    let (inbox, outbox) = queue(config.driver.queue);
-    let (core, store, journal) = begin(args, &config, clock)?;
-    let deliver = inbox.clone();
-    let store =
-        store::Writer::spawn(store, Duration::from_millis(config.store.commit_ms), move |done| deliver.deliver(done))?;
-    let (opened, network) = Link::open(&config, inbox.clone()).await?;
-    let (jobs, from) = (config.driver.jobs, inbox.clone());
-    let (driver, snapshots) = Driver::new(Parts { core, network, store, journal, outbox, inbox: from, clock, jobs });
-    let driver = tokio::spawn(driver.run(stop));
-    let link = opened.start(snapshots).await?;
-    info!(robot = %config.robot, swarm = %config.swarm, listen = ?config.zenoh.listen, "agent runs");
+    let mut host = Host::start(config, Options { journal: args.journal.clone(), seed: args.seed }).await?;
+    let inbox = host.inbox().clone();
     let side = [
         tokio::spawn(tell_drops(inbox.drops.clone())),
         tokio::spawn(feed(inbox, args.new_epoch, recording, args.speed)),
     ];
-    let finished = driver.await.context("the driver panicked; this is a bug")?;
-    info!(digest = %finished.digest, inputs = finished.inputs, "agent ends");
+    let broken = tokio::select! {
+        () = stop => None,
+        error = host.broken() => Some(error),
+    };
     side.iter().for_each(tokio::task::JoinHandle::abort);
-    link.close().await;
-    Ok(finished)
-}
-
-/// The core with what the store held, and the journal of its run.
-fn begin(args: &RunArgs, config: &FileConfig, clock: Clock) -> Result<(Agent, Store, Option<journal::Writer>)> {
-    let identity = config.identity()?;
-    let store = Store::open(&config.store.path, &identity.swarm, &identity.name)?;
-    let restored = store.load()?;
-    let seed = match args.seed {
-        Some(seed) => seed,
-        None => rand::rngs::SysRng.try_next_u64().context("the system's random source failed")?,
-    };
-    let now = clock.now();
-    let journal = match &args.journal {
-        Some(path) => {
-            let records: Vec<StoredRecord> = restored.records.iter().map(Into::into).collect();
-            let start = Start {
-                fresh_epoch: restored.fresh_epoch,
-                restored: records,
-                ..Start::new(&config.core, &identity, seed, now)
-            };
-            Some(journal::Writer::create(path, start).with_context(|| format!("journal {}", path.display()))?)
-        }
-        None => None,
-    };
-    info!(records = restored.records.len(), store = %config.store.path.display(), "store read");
-    let core = Agent::new(config.core.clone(), identity, seed, restored, now)?;
-    Ok((core, store, journal))
-}
-
-/// A recording, ready to be fed.
-struct Recorded {
-    /// What suits its sensor.
-    config: merganser_protocol::config::Config,
-    keyframes: Box<dyn Iterator<Item = Result<Keyframe>> + Send>,
-}
-
-impl Recorded {
-    fn open(_folder: &Path) -> Result<Self> {
-        anyhow::bail!("recordings cannot be read yet")
+    match broken {
+        Some(error) => Err(error.into()),
+        None => Ok(host.stop().await?),
     }
 }
 
 /// A recording knows what suits its sensor; a file that sets any of the core's knobs knows better.
-fn suit(config: &mut FileConfig, recording: &Recorded) {
+fn suit(config: &mut FileConfig, recording: &Recording) {
     if config.core == merganser_protocol::config::Config::default() {
-        config.core = recording.config.clone();
+        config.core = recording.manifest().config.clone();
     }
 }
 
@@ -181,7 +131,7 @@ async fn tell_drops(drops: Arc<Drops>) {
     }
 }
 
-async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recorded>, speed: f64) {
+async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recording>, speed: f64) {
     if new_epoch {
         inbox.feed(Input::Command(Command::NewEpoch)).await;
     }
@@ -191,11 +141,11 @@ async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recorded>, speed:
 }
 
 /// Feeds a recording in its own time, `speed` times faster, and closes the last submap.
-async fn play(inbox: &Inbox, recording: Recorded, speed: f64) {
+async fn play(inbox: &Inbox, recording: Recording, speed: f64) {
     let (sender, mut keyframes) = mpsc::channel(READ_AHEAD);
     let reader = tokio::task::spawn_blocking(move || {
-        for keyframe in recording.keyframes {
-            if sender.blocking_send(keyframe).is_err() {
+        for index in 0..recording.len() {
+            if sender.blocking_send(recording.keyframe(index)).is_err() {
                 return; // the agent ends
             }
         }

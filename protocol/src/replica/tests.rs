@@ -194,7 +194,14 @@ fn what_is_no_fork_proves_none() {
 
 #[test]
 fn a_fork_spreads_to_robots_that_saw_one_story_each() {
-    let (x, y) = (chain(1, 0, 5, 0), chain(1, 0, 3, 1));
+    // Of equal length only the heads' hash bytes tell the two stories apart.
+    one_story_each(3, 3);
+    one_story_each(5, 3);
+    one_story_each(3, 5);
+}
+
+fn one_story_each(x: u32, y: u32) {
+    let (x, y) = (chain(1, 0, x, 0), chain(1, 0, y, 1));
     let mut robots = [replica(), replica(), replica()];
     feed(&mut robots[0], &x);
     feed(&mut robots[1], &y);
@@ -263,6 +270,21 @@ fn deltas_keep_their_budget_and_say_when_they_were_cut() {
     let none = full.delta_for(&nothing, 0);
     assert!(none.more && none.entries.is_empty());
     assert!(!full.delta_for(&full.have(), 65_536).more);
+}
+
+#[test]
+fn under_a_small_budget_no_log_is_forgotten() {
+    let (mut full, mut asker) = (replica(), replica());
+    let frames: Vec<_> = (0..MEMBERS).flat_map(|n| (0..3).map(move |epoch| (n, epoch))).collect();
+    frames.iter().for_each(|&(n, epoch)| feed(&mut full, &chain(n, epoch, 40, 0)));
+    // 30 answers of about nine entries: a quarter of everything.
+    for _ in 0..30 {
+        pull(&mut asker, &full, 4096);
+    }
+    assert!(asker.count() < full.count() / 2);
+    for (n, epoch) in frames {
+        assert!(asker.next_seq(frame(n, epoch)) >= 3, "{n}/{epoch}");
+    }
 }
 
 #[test]
