@@ -138,6 +138,7 @@ fn run(
     say(&line(&report, wall))?;
     if !brief {
         say(&table(&report))?;
+        say(&laps(&outcome))?;
     }
     if twice && simulate(scenario, seed)?.trace != outcome.trace {
         bail!("seed {seed} gave two different traces; something outside the seed has an influence");
@@ -231,6 +232,13 @@ fn table(report: &Report) -> String {
         f.left
     );
     text
+}
+
+/// Where the wall time went.
+fn laps(outcome: &Outcome<Agent>) -> String {
+    let laps = outcome.stopwatch.laps().into_iter();
+    let laps: Vec<String> = laps.map(|(kind, calls, secs)| format!("{kind} {secs:.2} s in {calls}")).collect();
+    format!("wall time: {}", laps.join(", "))
 }
 
 fn say(text: &str) -> std::io::Result<()> {

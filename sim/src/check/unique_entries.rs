@@ -1,5 +1,6 @@
-//! One place in a log, one content (DESIGN §8.5): never two entries for one (origin, epoch, seq) anywhere in the swarm,
-//! and never two contents under one blob address.
+//! One place in a log, one content (DESIGN §8.5): never two entries for one (origin, epoch, seq) on the swarm's disks, and
+//! never two contents under one blob address. An entry that died with its writer before it was durable does not count:
+//! if it got out all the same, another robot's disk shows it.
 
 use super::{Check, Seen};
 use merganser_protocol::agent::io::{Output, Record};
@@ -10,6 +11,8 @@ use std::collections::BTreeMap;
 #[derive(Debug, Default)]
 pub struct UniqueEntries {
     entries: BTreeMap<EntryId, Hash>,
+    /// Handed to each robot's disk, by batch.
+    waiting: BTreeMap<usize, Vec<(u64, EntryId, Hash)>>,
 }
 
 impl Check for UniqueEntries {
@@ -18,20 +21,31 @@ impl Check for UniqueEntries {
     }
 
     fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
-        let Seen::Output(Output::Persist { records, .. }) = seen else { return Ok(()) };
-        for record in records {
-            match record {
-                Record::Entry { id, bytes } => {
-                    let hash = Hash::of(bytes);
-                    if *self.entries.entry(*id).or_insert(hash) != hash {
+        let waiting = self.waiting.entry(robot).or_default();
+        match seen {
+            Seen::Output(Output::Persist { batch, records }) => {
+                for record in records {
+                    match record {
+                        Record::Entry { id, bytes } => waiting.push((*batch, *id, Hash::of(bytes))),
+                        Record::Blob { hash, bytes } if Hash::of(bytes) != *hash => {
+                            return Err(format!("robot {robot}: blob {hash} holds something else"));
+                        }
+                        _ => {}
+                    }
+                }
+            }
+            Seen::Durable(batch) => {
+                let (durable, later) = waiting.iter().partition(|(number, ..)| number <= batch);
+                *waiting = later;
+                let durable: Vec<(u64, EntryId, Hash)> = durable;
+                for (_, id, hash) in durable {
+                    if *self.entries.entry(id).or_insert(hash) != hash {
                         return Err(format!("robot {robot}: a second content for entry {id}"));
                     }
                 }
-                Record::Blob { hash, bytes } if Hash::of(bytes) != *hash => {
-                    return Err(format!("robot {robot}: blob {hash} holds something else"));
-                }
-                _ => {}
             }
+            Seen::Died => waiting.clear(),
+            _ => {}
         }
         Ok(())
     }
@@ -47,13 +61,27 @@ mod tests {
         Output::Persist { batch: 1, records: vec![Record::Entry { id, bytes: vec![byte] }] }
     }
 
+    fn store(check: &mut UniqueEntries, robot: usize, output: &Output) -> Result<(), String> {
+        check.see(robot, &Seen::Output(output))?;
+        check.see(robot, &Seen::Durable(1))
+    }
+
     #[test]
     fn it_bites_on_a_reused_sequence_number() {
         let mut check = UniqueEntries::default();
+        assert!(store(&mut check, 0, &entry(0, 1)).is_ok());
+        assert!(store(&mut check, 1, &entry(0, 1)).is_ok());
+        assert!(store(&mut check, 0, &entry(1, 2)).is_ok());
+        assert!(store(&mut check, 0, &entry(0, 2)).is_err());
+    }
+
+    #[test]
+    fn what_died_unseen_may_be_written_anew() {
+        let mut check = UniqueEntries::default();
         assert!(check.see(0, &Seen::Output(&entry(0, 1))).is_ok());
-        assert!(check.see(1, &Seen::Output(&entry(0, 1))).is_ok());
-        assert!(check.see(0, &Seen::Output(&entry(1, 2))).is_ok());
-        assert!(check.see(0, &Seen::Output(&entry(0, 2))).is_err());
+        assert!(check.see(0, &Seen::Died).is_ok());
+        assert!(store(&mut check, 0, &entry(0, 2)).is_ok());
+        assert!(store(&mut check, 1, &entry(0, 1)).is_err(), "unless somebody else holds it");
     }
 
     #[test]

@@ -52,7 +52,8 @@ impl<C: Core> Swarm<C> {
                 self.feed(now, robot, Input::PersistFailed { batch, reason: "no space left on device".to_owned() });
             }
             Event::JobDone { robot, incarnation, id, job } if self.runs(robot, incarnation) => {
-                self.feed(now, robot, Input::JobDone { job: id, result: job.run() });
+                let result = self.stopwatch.time(job.kind(), || job.run());
+                self.feed(now, robot, Input::JobDone { job: id, result });
             }
             Event::Wake { robot, incarnation, at }
                 if self.runs(robot, incarnation) && self.robots[robot].wake == Some(at) =>
@@ -85,7 +86,8 @@ impl<C: Core> Swarm<C> {
             self.counts.keyframes_missed += 1;
             return;
         }
-        let keyframe = match one.slam.keyframe(step, self.stage.scan(robot, index)) {
+        let points = self.stopwatch.time("scan", || self.stage.scan(robot, index));
+        let keyframe = match one.slam.keyframe(step, points) {
             Ok(keyframe) => keyframe,
             Err(error) => return self.object("stage", error.to_string()),
         };
@@ -108,7 +110,7 @@ impl<C: Core> Swarm<C> {
             return;
         };
         self.trace.input(now, robot, &input);
-        core.handle(local, input);
+        self.stopwatch.time("handle", || core.handle(local, input));
         self.drain(now, robot);
     }
 

@@ -6,10 +6,12 @@ mod act;
 #[cfg(test)]
 mod fake;
 mod robot;
+mod stopwatch;
 mod store;
 mod trace;
 
 pub use robot::Usage;
+pub use stopwatch::Stopwatch;
 
 use crate::check::{Checks, Phase, RobotSample, Sample, Seen, Violation};
 use crate::core::Core;
@@ -66,6 +68,7 @@ pub struct Swarm<C> {
     counts: FaultCounts,
     truth: BTreeMap<String, Se3>,
     told: Vec<(f64, usize, Told)>,
+    stopwatch: Stopwatch,
     violation: Option<Violation>,
     healed: bool,
     done_samples: u32,
@@ -104,6 +107,8 @@ pub struct Outcome<C> {
     pub truth: BTreeMap<String, Se3>,
     /// What the agents told people: seconds, robot, event.
     pub told: Vec<(f64, usize, Told)>,
+    /// Where the wall time went.
+    pub stopwatch: Stopwatch,
     _core: core::marker::PhantomData<C>,
 }
 
@@ -172,6 +177,7 @@ impl<C: Core> Swarm<C> {
             counts: FaultCounts::default(),
             truth: BTreeMap::new(),
             told: Vec::new(),
+            stopwatch: Stopwatch::default(),
             violation: None,
             healed: false,
             done_samples: 0,
@@ -231,6 +237,7 @@ impl<C: Core> Swarm<C> {
             usage: self.robots.into_iter().map(|robot| robot.usage).collect(),
             truth: self.truth,
             told: self.told,
+            stopwatch: self.stopwatch,
             scenario: self.scenario,
             stage: self.stage,
             seed: self.seed,
@@ -407,23 +414,30 @@ impl<C: Core> Swarm<C> {
         self.done_samples = if done { self.done_samples + 1 } else { 0 };
         let phase = if self.healed { Phase::Calm } else { Phase::Storm };
         let sample = Sample { phase, robots, truth: &self.truth, expect: &self.scenario.expect };
-        if let Some(violation) = self.checks.sample(now, &sample) {
+        let (checks, stopwatch) = (&mut self.checks, &mut self.stopwatch);
+        if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {
             self.violation.get_or_insert(violation);
         }
         self.queue.push(now.after(millis(1000.0)), Event::Sample);
     }
 
-    fn robot_samples(&self, now: Instant) -> Vec<RobotSample> {
-        let sample = |robot: &Robot<C>| {
+    fn robot_samples(&mut self, now: Instant) -> Vec<RobotSample> {
+        let stopwatch = &mut self.stopwatch;
+        let mut sample = |robot: &Robot<C>| {
             let local = robot.local(now);
             let core = robot.core.as_ref()?;
-            Some(RobotSample { name: robot.name.to_string(), digest: core.digest(), snapshot: core.snapshot(local) })
+            Some(RobotSample {
+                name: robot.name.to_string(),
+                digest: core.digest(),
+                snapshot: stopwatch.time("snapshot", || core.snapshot(local)),
+            })
         };
-        self.robots.iter().filter_map(sample).collect()
+        self.robots.iter().filter_map(&mut sample).collect()
     }
 
     fn see(&mut self, robot: usize, seen: &Seen<'_>) {
-        if let Some(violation) = self.checks.see(self.queue.now(), robot, seen) {
+        let (checks, now) = (&mut self.checks, self.queue.now());
+        if let Some(violation) = self.stopwatch.time("check", || checks.see(now, robot, seen)) {
             self.violation.get_or_insert(violation);
         }
     }

@@ -38,8 +38,8 @@ impl Default for DriveOptions {
             speed_m_s: 1.0,
             keyframe_m: 0.8,
             tilt_deg: 1.5,
-            drift_m_per_sqrt_m: 0.012,
-            drift_deg_per_sqrt_m: 0.25,
+            drift_m_per_sqrt_m: 0.01,
+            drift_deg_per_sqrt_m: 0.1,
             drift_per_sqrt_turn: 0.003,
         }
     }
