@@ -62,7 +62,8 @@ fn run_is_fed_watched_ended_and_replayed() {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path();
     recording(&folder.join("walk"));
-    let endpoints = write_configs(folder, &["alpha"]);
+    let endpoints = write_configs(folder, &["alpha", "beta"]);
+    let other = spawn(&["run", "-c", "beta.toml"], folder); // a robot alone has nobody to send a beacon to
     let arguments = [
         "run",
         "-c",
