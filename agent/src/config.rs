@@ -338,7 +338,11 @@ impl FileConfig {
 }
 
 impl ZenohConfig {
-    fn validate(&self) -> Result<(), ValueError> {
+    /// Checks every value that the types do not.
+    ///
+    /// # Errors
+    /// [`ValueError`] for the first that cannot work.
+    pub fn validate(&self) -> Result<(), ValueError> {
         let bytes = self.message_bytes_max as f64;
         let (low, high) = (MESSAGE_BYTES_MIN as f64, MESSAGE_BYTES_MAX as f64);
         within("zenoh.message_bytes_max", bytes, low, high, "use 65536 to 16777216 bytes")?;

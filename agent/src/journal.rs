@@ -7,6 +7,7 @@
 
 use crate::observation::{KeyframeMessage, ObservationError};
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, JobId, QueryId, QueryKind, Record, Sighting};
+use merganser_protocol::agent::{Identity, Restored};
 use merganser_protocol::config::Config;
 use merganser_protocol::ids::{EntryId, Hash, Name, RobotId, SubmapId};
 use merganser_protocol::time::Instant;
@@ -47,7 +48,7 @@ pub struct Start {
 
 impl Start {
     /// The start of a run.
-    pub fn new(config: &Config, identity: &merganser_protocol::agent::Identity, seed: u64, now: Instant) -> Self {
+    pub fn new(config: &Config, identity: &Identity, seed: u64, restored: &Restored, now: Instant) -> Self {
         Self {
             version: VERSION,
             config: config.clone(),
@@ -55,8 +56,8 @@ impl Start {
             robot: identity.name.clone(),
             roster: identity.roster.clone(),
             seed,
-            fresh_epoch: 0,
-            restored: Vec::new(),
+            fresh_epoch: restored.fresh_epoch,
+            restored: restored.records.iter().map(Into::into).collect(),
             now,
         }
     }

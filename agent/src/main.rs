@@ -1,3 +1,5 @@
-//! The `merganser` program.
+//! The `merganser` program; see [`merganser::cli`].
 
-fn main() {}
+fn main() -> std::process::ExitCode {
+    merganser::cli::main(std::env::args_os())
+}

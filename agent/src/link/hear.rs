@@ -8,6 +8,7 @@ use crate::observation::{self, Format};
 use crate::queue::Source;
 use merganser_protocol::agent::io::{AskToken, Channel, Input, QueryKind};
 use merganser_protocol::ids::{Name, RobotId};
+use merganser_protocol::wire::limits::{MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -17,8 +18,8 @@ use zenoh::bytes::Encoding;
 use zenoh::query::Query;
 use zenoh::sample::{Locality, Sample, SampleKind};
 
-/// Largest message of a peer that is handed to the core, in bytes: an answer holds 64 KiB of entries, a blob less.
-const PEER_BYTES_MAX: usize = 256 << 10;
+/// Largest message of a peer that is handed to the core, in bytes.
+const PEER_BYTES_MAX: usize = MESSAGE_LEN_MAX + MESSAGE_OVERHEAD_MAX;
 
 /// Declares everything; the task tells the core who is there.
 pub(super) async fn start(shared: &Arc<Shared>) -> Result<JoinHandle<()>, LinkError> {

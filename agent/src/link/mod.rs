@@ -61,7 +61,7 @@ impl Link {
     /// # Errors
     /// [`LinkError`].
     pub async fn open(config: &FileConfig, inbox: Inbox) -> Result<(Opened, Sender), LinkError> {
-        let session = session::open(&config.zenoh).await?;
+        let session = session::open(&config.zenoh, session::Role::Robot).await?;
         let ids = config.roster.iter().map(|(name, key)| (name.clone(), RobotId::of_key(&key.to_bytes())));
         let ids: BTreeMap<Name, RobotId> = ids.collect();
         let shared = Arc::new(Shared {

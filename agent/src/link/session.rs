@@ -42,13 +42,22 @@ pub enum LinkError {
     },
 }
 
+/// What a session is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    /// A robot of the swarm.
+    Robot,
+    /// Somebody who only looks on: opens links to all it hears of, because nobody can open one to it.
+    Onlooker,
+}
+
 /// Opens a session.
 ///
 /// # Errors
 /// [`LinkError`].
-pub async fn open(config: &ZenohConfig) -> Result<Session, LinkError> {
+pub async fn open(config: &ZenohConfig, role: Role) -> Result<Session, LinkError> {
     let refused = |reason| LinkError::Open { listen: config.listen.clone(), reason };
-    let settings = settings(config)?;
+    let settings = settings(config, role)?;
     match tokio::time::timeout(OPEN_TIMEOUT, zenoh::open(settings)).await {
         Ok(session) => session.map_err(|error| refused(error.to_string())),
         Err(_) => Err(refused(format!("no answer in {} s", OPEN_TIMEOUT.as_secs()))),
@@ -64,11 +73,14 @@ pub async fn close(session: &Session, wait: Duration) {
     }
 }
 
-fn settings(config: &ZenohConfig) -> Result<Config, LinkError> {
+fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
     let mut settings = Config::default();
     for (key, value) in [
         ("mode", json!(config.mode.as_str())),
-        ("listen/endpoints", json!(if config.mode == Mode::Client { &[] } else { config.listen.as_slice() })),
+        (
+            "listen/endpoints",
+            json!(if config.mode == Mode::Client || role == Role::Onlooker { &[] } else { config.listen.as_slice() }),
+        ),
         ("connect/endpoints", json!(config.connect)),
         // A robot that is not there yet must not keep this one from starting.
         ("connect/timeout_ms", json!({"router": -1, "peer": -1, "client": 10_000})),
@@ -76,9 +88,9 @@ fn settings(config: &ZenohConfig) -> Result<Config, LinkError> {
         ("connect/retry", json!({"period_init_ms": 250, "period_max_ms": 4000, "period_increase_factor": 2.0})),
         ("scouting/multicast/enabled", json!(config.multicast)),
         ("scouting/multicast/interface", json!(config.interface)),
-        ("scouting/multicast/autoconnect_strategy", one_opens()),
+        ("scouting/multicast/autoconnect_strategy", strategy(role)),
         ("scouting/gossip/enabled", json!(config.gossip)),
-        ("scouting/gossip/autoconnect_strategy", one_opens()),
+        ("scouting/gossip/autoconnect_strategy", strategy(role)),
         ("transport/link/tx/lease", json!((config.lease_secs * 1e3) as u64)),
         ("transport/link/rx/max_message_size", json!(config.message_bytes_max)),
         ("transport/shared_memory/enabled", json!(false)),
@@ -95,9 +107,10 @@ fn settings(config: &ZenohConfig) -> Result<Config, LinkError> {
 
 /// Of two robots that find each other, one opens the link: with two links per pair, healthy neighbours of a lost robot
 /// were measured to freeze for seconds.
-fn one_opens() -> Value {
-    json!({"router": {"to_router": "greater-zid", "to_peer": "greater-zid"},
-           "peer": {"to_router": "always", "to_peer": "greater-zid"}})
+fn strategy(role: Role) -> Value {
+    let among_peers = if role == Role::Robot { "greater-zid" } else { "always" };
+    json!({"router": {"to_router": among_peers, "to_peer": among_peers},
+           "peer": {"to_router": "always", "to_peer": among_peers}})
 }
 
 /// Everything may be asked, declared and sent. What may come in as a publication is what [`keys`] knows, and `…/in/*`

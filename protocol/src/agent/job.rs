@@ -1,21 +1,163 @@
-//! Heavy work as a value: a pure function of its data, run by the shell wherever it likes.
+//! Heavy work as a value: a pure function of its data, run by the shell wherever it likes. The simulator runs jobs
+//! inline and charges virtual time by [`Job::kind`]; a replay runs them again instead of storing their results.
+
+use crate::align::{Model, Problem, SolverConfig};
+use crate::config::{AlignConfig, EstimateConfig, SubmapConfig};
+use crate::estimate::joint::{JointEstimate, MapProblem, solve_map};
+use crate::geometry::Relative;
+use crate::ids::{FrameId, SubmapId};
+use crate::submap::{self, Described, Features, Keypoints, RefineConfig, Submap};
+use crate::wire::fact::{RefusalReason, ScaleKind};
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// A piece of heavy work.
 #[derive(Clone, Debug)]
-pub enum Job {}
+pub enum Job {
+    /// Describe a finished submap.
+    Describe(Box<DescribeJob>),
+    /// Align a peer's keypoints with one of our submaps.
+    Align(Box<AlignJob>),
+    /// Solve the joint estimate.
+    Solve(Box<SolveJob>),
+}
+
+/// See [`Job::Describe`].
+#[derive(Clone, Debug)]
+pub struct DescribeJob {
+    /// The submap, which comes back with the result.
+    pub submap: Submap,
+    /// How to describe it.
+    pub config: SubmapConfig,
+}
+
+/// See [`Job::Align`].
+#[derive(Clone, Debug)]
+pub struct AlignJob {
+    /// The peer's keypoints, in its anchor frame.
+    pub theirs: Arc<Keypoints>,
+    /// Our features, in our anchor frame.
+    pub mine: Arc<Features>,
+    /// Acceptance.
+    pub config: AlignConfig,
+    /// Thinning voxel of our submaps, m: the unit of the noise bound.
+    pub voxel_m: f64,
+    /// SE(3), or SIM(3) if either side's unit is unknown.
+    pub scale: ScaleKind,
+    /// Seed of the sampler: our own, so that the two endpoints are independent.
+    pub seed: u64,
+}
+
+/// See [`Job::Solve`].
+#[derive(Clone, Debug)]
+pub struct SolveJob {
+    /// What is known.
+    pub problem: MapProblem,
+    /// How to solve it.
+    pub config: EstimateConfig,
+    /// The frame that views are given in.
+    pub own: FrameId,
+}
 
 /// What a [`Job`] gave.
 #[derive(Clone, Debug)]
-pub enum JobResult {}
+pub enum JobResult {
+    /// Of [`Job::Describe`].
+    Described(Box<(Submap, Described)>),
+    /// Of [`Job::Align`].
+    Aligned(Result<Box<Measured>, RefusalReason>),
+    /// Of [`Job::Solve`].
+    Solved(Box<Solved>),
+}
+
+/// The joint estimate and what people look at most.
+#[derive(Clone, Debug)]
+pub struct Solved {
+    /// The estimate.
+    pub estimate: Arc<JointEstimate>,
+    /// `t_own_anchor` of every submap connected to our frame.
+    pub anchors: BTreeMap<SubmapId, Relative>,
+}
+
+/// An alignment that passed every gate.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    /// `t_mine_theirs`.
+    pub t_mine_theirs: Relative,
+    /// σ̂ of the correspondences, in our units.
+    pub sigma: f64,
+    /// Σ of inlier probabilities.
+    pub support: f64,
+    /// log₁₀ NFA.
+    pub log10_nfa: f64,
+}
 
 impl Job {
     /// Does the work. Deterministic: the same job gives the same result.
     pub fn run(self) -> JobResult {
-        match self {}
+        match self {
+            Self::Describe(job) => {
+                let described = submap::describe(&job.submap, &job.config);
+                JobResult::Described(Box::new((job.submap, described)))
+            }
+            Self::Align(job) => JobResult::Aligned(job.run().map(Box::new)),
+            Self::Solve(job) => JobResult::Solved(Box::new(job.run())),
+        }
     }
 
-    /// A short name for logs and statistics.
+    /// A short name for logs, statistics and cost models.
     pub fn kind(&self) -> &'static str {
-        match *self {}
+        match self {
+            Self::Describe(_) => "describe",
+            Self::Align(_) => "align",
+            Self::Solve(_) => "solve",
+        }
+    }
+}
+
+impl SolveJob {
+    fn run(&self) -> Solved {
+        let estimate = Arc::new(solve_map(&self.problem, &self.config));
+        let anchors = estimate.anchors(self.own).into_iter().collect();
+        Solved { estimate, anchors }
+    }
+}
+
+impl AlignJob {
+    /// Matches, finds a consensus, checks the fit, refines (MATH §4; PERCEPTION).
+    fn run(&self) -> Result<Measured, RefusalReason> {
+        let matches = submap::match_keypoints(&self.theirs, &self.mine);
+        let problem = Problem { source: &matches.source, target: &matches.target, scores: Some(&matches.scores) };
+        let found = crate::align::align(&problem, &self.solver())
+            .map_err(|_| RefusalReason::BadInput)?
+            .map_err(RefusalReason::from)?;
+        let radius = self.voxel_m * 1.5;
+        let fit = submap::fit(&self.theirs, &self.mine, &found.t_target_source.sim(), radius);
+        if fit < self.config.fit_min {
+            return Err(RefusalReason::PoorFit);
+        }
+        let t_mine_theirs = match &found.t_target_source {
+            Relative::Metric(p) => {
+                let refined = submap::refine(&self.theirs, &self.mine, &p.pose, &RefineConfig::default());
+                Relative::Metric(refined.map_err(|_| RefusalReason::Degenerate)?.pose)
+            }
+            similarity @ Relative::Similarity(_) => *similarity,
+        };
+        let (sigma, support, log10_nfa) = (found.sigma, found.support, found.log10_nfa);
+        Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
+    }
+
+    fn solver(&self) -> SolverConfig {
+        SolverConfig {
+            model: match self.scale {
+                ScaleKind::Metric => Model::Rigid,
+                ScaleKind::Unknown => Model::Similarity { scale_min: 0.05, scale_max: 20.0 },
+            },
+            sigma_max: self.config.sigma_max_voxels * self.voxel_m,
+            log10_nfa_max: self.config.log10_nfa_max,
+            support_min: self.config.support_min,
+            seed: self.seed,
+            ..SolverConfig::default()
+        }
     }
 }

@@ -1,14 +1,44 @@
 //! The state machine of one robot: facts, gossip, negotiation and the joint estimate behind one `Input`/`Output` door.
+//!
+//! The contract (tested in this module): call [`Agent::handle`] once, drain [`Agent::poll_output`] until it is empty,
+//! then wait until [`Agent::poll_timeout`] or the next input. Only `handle` changes anything.
+//!
+//! Nothing is advertised before it is durable: a new entry goes out as [`Output::Persist`] and takes effect (is
+//! published, counted in the have-vector, used in the estimate) when [`Input::Persisted`] confirms it.
 
+mod aligning;
+mod gossip;
 pub mod io;
 pub mod job;
+mod knowledge;
+mod mapping;
+mod negotiation;
+mod solving;
+mod stats;
+mod view;
 
 use crate::config::{Config, ConfigError};
-use crate::ids::{FrameId, Hash, Name, RobotId};
+use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
+use crate::replica::{AppendError, IngestError, Ingested, Replica, RosterError};
 use crate::time::Instant;
-use io::{Input, Output, Record};
-use std::collections::BTreeMap;
+use crate::wire::EntryBytes;
+use crate::wire::fact::Fact;
+use ed25519_dalek::SigningKey;
+use gossip::Gossip;
+use io::{Command, Event, Input, JobId, Output, QueryId, Record};
+use job::{Job, JobResult};
+use knowledge::Knowledge;
+use mapping::Mapper;
+use negotiation::Negotiation;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use solving::MapState;
+use stats::Stats;
+use std::collections::{BTreeMap, VecDeque};
 use thiserror::Error;
+
+pub use knowledge::Agreement;
+pub use negotiation::{ALIGNMENTS_PER_FRAME_PAIR, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP};
 
 /// Who this agent is and whom it trusts.
 #[derive(Clone)]
@@ -34,9 +64,9 @@ pub enum StartError {
         "robot {0} is not in the roster with the public half of its key; add the line that `keys generate` printed"
     )]
     NotInRoster(Name),
-    /// The store holds something that this agent did not write.
-    #[error("the store is damaged: {0}; restore a copy or start with an empty store, which begins a new epoch")]
-    Store(String),
+    /// The roster holds a key that is no ed25519 public key, or one key twice.
+    #[error(transparent)]
+    Roster(#[from] RosterError),
 }
 
 /// What the shell kept from earlier runs.
@@ -48,50 +78,321 @@ pub struct Restored {
     pub fresh_epoch: u32,
 }
 
-/// One robot's agent. Call [`Agent::handle`] once, drain [`Agent::poll_output`] until it is empty, then wait until
-/// [`Agent::poll_timeout`] or the next input.
-pub struct Agent {}
+/// One robot's agent.
+pub struct Agent {
+    config: Config,
+    me: Me,
+    seed: u64,
+    rng: ChaCha8Rng,
+    now: Instant,
+    outputs: VecDeque<Output>,
+    ledger: Ledger,
+    replica: Replica,
+    knowledge: Knowledge,
+    mapper: Mapper,
+    negotiation: Negotiation,
+    gossip: Gossip,
+    map: MapState,
+    stats: Stats,
+    receive_only: bool,
+    next_job: u64,
+    next_query: u64,
+}
+
+/// This robot and its swarm.
+struct Me {
+    robot: RobotId,
+    frame: FrameId,
+    key: SigningKey,
+    name: Name,
+    swarm: Name,
+}
+
+/// Records on their way to the disk.
+#[derive(Default)]
+struct Ledger {
+    open: Vec<Record>,
+    last_batch: u64,
+    waiting: BTreeMap<u64, Vec<EntryId>>,
+}
 
 impl Agent {
-    /// A new agent.
+    /// A new agent, resuming from what the shell kept.
     ///
     /// # Errors
     /// [`StartError`] for a bad configuration, roster or store.
     pub fn new(
-        _config: Config,
-        _identity: Identity,
-        _seed: u64,
-        _restored: Restored,
-        _now: Instant,
+        config: Config,
+        identity: Identity,
+        seed: u64,
+        restored: Restored,
+        now: Instant,
     ) -> Result<Self, StartError> {
-        Ok(Self {})
+        config.validate()?;
+        let key = SigningKey::from_bytes(&identity.secret_key);
+        let public = key.verifying_key().to_bytes();
+        if identity.roster.get(&identity.name) != Some(&public) {
+            return Err(StartError::NotInRoster(identity.name));
+        }
+        let robot = RobotId::of_key(&public);
+        let replica = Replica::new(&identity.swarm, identity.roster, &config.gossip)?;
+        let frame = FrameId { robot, epoch: restored.fresh_epoch };
+        let mut agent = Self {
+            mapper: Mapper::new(&config.submap),
+            gossip: Gossip::new(now),
+            me: Me { robot, frame, key, name: identity.name, swarm: identity.swarm },
+            rng: ChaCha8Rng::seed_from_u64(seed),
+            config,
+            seed,
+            now,
+            replica,
+            outputs: VecDeque::new(),
+            ledger: Ledger::default(),
+            knowledge: Knowledge::default(),
+            negotiation: Negotiation::default(),
+            map: MapState::default(),
+            stats: Stats::default(),
+            receive_only: false,
+            next_job: 1,
+            next_query: 1,
+        };
+        agent.restore(restored);
+        Ok(agent)
     }
 
     /// Takes one input.
-    pub fn handle(&mut self, _now: Instant, _input: Input) {}
+    pub fn handle(&mut self, now: Instant, input: Input) {
+        self.now = self.now.max(now);
+        match input {
+            Input::Keyframe(keyframe) => self.on_keyframe(keyframe),
+            Input::Sighting(sighting) => self.on_sighting(&sighting),
+            Input::Received { from, channel, bytes } => self.on_received(from, channel, &bytes),
+            Input::Asked { token, kind, bytes } => self.on_asked(token, kind, &bytes),
+            Input::Answered { query, bytes } => self.on_answered(query, bytes.as_deref()),
+            Input::Neighbour { robot, up } => self.on_neighbour(robot, up),
+            Input::Persisted { up_to } => self.on_persisted(up_to),
+            Input::PersistFailed { batch: _, reason } => self.on_persist_failed(reason),
+            Input::JobDone { job, result } => self.on_job_done(job, result),
+            Input::Timeout => {}
+            Input::Command(Command::Flush) => self.close_submap(),
+            Input::Command(Command::NewEpoch) => self.begin_epoch(self.me.frame.epoch.saturating_add(1)),
+        }
+        self.run_timers();
+        self.start_describing();
+        self.start_aligning();
+        self.start_solving();
+        self.close_batch();
+    }
 
     /// The next output, if any. Only [`Agent::handle`] makes new ones.
     pub fn poll_output(&mut self) -> Option<Output> {
-        None
+        self.outputs.pop_front()
     }
 
     /// When [`Input::Timeout`] is wanted. Only [`Agent::handle`] changes it.
     pub fn poll_timeout(&self) -> Option<Instant> {
-        None
+        [self.gossip_timeout(), self.fetch_timeout(), self.solve_timeout()].into_iter().flatten().min()
     }
 
     /// This robot.
     pub fn robot(&self) -> RobotId {
-        RobotId([0; 8])
+        self.me.robot
     }
 
     /// The frame that this robot writes now.
     pub fn frame(&self) -> FrameId {
-        FrameId { robot: self.robot(), epoch: 0 }
+        self.me.frame
     }
 
-    /// BLAKE3 digest of the set of entries held: equal sets, equal digests.
+    /// BLAKE3 digest of the set of durable entries held: equal sets, equal digests.
     pub fn digest(&self) -> Hash {
-        Hash::default()
+        self.replica.digest()
+    }
+
+    /// Loads what is sound. A damaged log of our own must not be continued, since others may hold what is missing here:
+    /// a new epoch begins. Damage elsewhere is fetched again from neighbours.
+    fn restore(&mut self, restored: Restored) {
+        let mut entries = Vec::new();
+        let mut private = Vec::new();
+        for record in restored.records {
+            match record {
+                Record::Entry { bytes, .. } => entries.push(bytes),
+                Record::Blob { bytes, .. } => self.keep_blob(bytes),
+                Record::Private { submap, bytes } => private.push((submap, bytes)),
+            }
+        }
+        let loaded = self.replica.restore(entries);
+        if let Some(epoch) = self.replica.epochs_of(self.me.robot).next_back() {
+            self.me.frame.epoch = epoch;
+        }
+        if let Err(damage) = loaded {
+            self.reject(None, "store", &damage.to_string());
+            if damage.concerns(self.me.frame) {
+                self.begin_epoch(self.me.frame.epoch.saturating_add(1));
+            }
+        }
+        self.relearn();
+        for (submap, bytes) in private {
+            self.restore_features(submap, &bytes);
+        }
+        self.resume_mapping();
+    }
+
+    /// Writes a fact of our own; it takes effect once it is durable.
+    fn write(&mut self, epoch: u32, fact: &Fact) {
+        if self.receive_only {
+            return;
+        }
+        match self.replica.append(&self.me.key, epoch, fact) {
+            Ok(entry) => self.ledger.open.push(Record::Entry { id: entry.id(), bytes: entry.encode() }),
+            Err(error) => {
+                self.reject(Some(self.me.robot), "own fact", &error.to_string());
+                if matches!(error, AppendError::NewEpochNeeded(frame, _) if frame == self.me.frame) {
+                    self.begin_epoch(self.me.frame.epoch.saturating_add(1));
+                }
+            }
+        }
+    }
+
+    /// Takes an entry from a peer; it takes effect once it is durable.
+    fn ingest(&mut self, from: Option<RobotId>, bytes: &[u8]) {
+        match self.replica.ingest(bytes) {
+            Ok(Ingested::New(ids)) => {
+                for id in ids {
+                    let Some(bytes) = self.replica.entry_bytes(id) else { continue };
+                    self.ledger.open.push(Record::Entry { id, bytes: bytes.to_vec() });
+                    self.meet_own_past(id);
+                }
+            }
+            Ok(Ingested::Known | Ingested::Early(_)) => {}
+            Err(error @ IngestError::Fork(frame)) => {
+                self.reject(Some(frame.robot), error.reason(), &error.to_string());
+                self.relearn();
+            }
+            Err(error) => self.reject(from, error.reason(), &error.to_string()),
+        }
+    }
+
+    /// Takes the proof that a log has two histories.
+    fn ingest_fork(&mut self, from: RobotId, [a, b]: &[EntryBytes; 2]) {
+        match self.replica.ingest_fork(&a.0, &b.0) {
+            Ok((frame, true)) => {
+                self.reject(Some(frame.robot), "fork", &format!("log {frame} has two histories; it is quarantined"));
+                self.relearn();
+            }
+            Ok((_, false)) => {}
+            Err(error) => self.reject(Some(from), error.reason(), &error.to_string()),
+        }
+    }
+
+    /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide.
+    fn meet_own_past(&mut self, id: EntryId) {
+        if id.frame.robot == self.me.robot && id.frame.epoch >= self.me.frame.epoch {
+            self.begin_epoch(id.frame.epoch.saturating_add(1));
+        }
+    }
+
+    /// A new local frame begins: the trajectory so far is closed.
+    fn begin_epoch(&mut self, epoch: u32) {
+        self.close_submap();
+        self.me.frame.epoch = epoch;
+        self.mapper.restart(&self.config.submap);
+        self.event(Event::EpochBegan { frame: self.me.frame });
+    }
+
+    fn close_batch(&mut self) {
+        if self.ledger.open.is_empty() {
+            return;
+        }
+        let records = core::mem::take(&mut self.ledger.open);
+        self.ledger.last_batch += 1;
+        let entries = records.iter().filter_map(|record| match record {
+            Record::Entry { id, .. } => Some(*id),
+            _ => None,
+        });
+        self.ledger.waiting.insert(self.ledger.last_batch, entries.collect());
+        self.outputs.push_back(Output::Persist { batch: self.ledger.last_batch, records });
+    }
+
+    fn on_persisted(&mut self, up_to: u64) {
+        let later = self.ledger.waiting.split_off(&up_to.saturating_add(1));
+        let durable = core::mem::replace(&mut self.ledger.waiting, later);
+        let mut own = Vec::new();
+        for id in durable.into_values().flatten() {
+            self.replica.mark_durable(id);
+            self.learn(id);
+            if id.frame.robot == self.me.robot {
+                own.push(id);
+            }
+        }
+        self.publish_entries(&own);
+    }
+
+    fn on_persist_failed(&mut self, reason: String) {
+        if !core::mem::replace(&mut self.receive_only, true) {
+            self.event(Event::ReceiveOnly { reason });
+        }
+    }
+
+    /// A durable entry takes effect.
+    fn learn(&mut self, id: EntryId) {
+        let Some(entry) = self.replica.entry(id).filter(|entry| !self.replica.is_quarantined(entry.id().frame)) else {
+            return;
+        };
+        match entry.fact() {
+            Ok(fact) => {
+                self.knowledge.absorb(id, fact.clone());
+                self.map.dirty = true;
+                self.on_fact(id, &fact);
+            }
+            Err(error) => self.reject(Some(id.frame.robot), error.reason(), &format!("{id}: {error}")),
+        }
+    }
+
+    /// Forgets and learns everything again: at start, and when a quarantine takes facts away.
+    fn relearn(&mut self) {
+        self.knowledge = Knowledge::default();
+        self.negotiation.clear_candidates();
+        let facts: Vec<(EntryId, Fact)> = self.replica.facts().collect();
+        for (id, fact) in &facts {
+            self.knowledge.absorb(*id, fact.clone());
+        }
+        for (id, fact) in &facts {
+            self.on_fact(*id, fact);
+        }
+        self.map.dirty = true;
+    }
+
+    fn on_job_done(&mut self, id: JobId, result: JobResult) {
+        match result {
+            JobResult::Described(described) => self.on_described(id, *described),
+            JobResult::Aligned(outcome) => self.on_aligned(id, outcome),
+            JobResult::Solved(solved) => self.on_solved(id, *solved),
+        }
+    }
+
+    fn run_job(&mut self, job: Job) -> JobId {
+        let id = JobId(self.next_job);
+        self.next_job += 1;
+        self.stats.worked(job.kind());
+        self.outputs.push_back(Output::Run { id, job });
+        id
+    }
+
+    fn new_query(&mut self) -> QueryId {
+        let id = QueryId(self.next_query);
+        self.next_query += 1;
+        id
+    }
+
+    fn event(&mut self, event: Event) {
+        self.outputs.push_back(Output::Event(event));
+    }
+
+    /// Counts a refusal and reports it, at most once per peer and interval.
+    fn reject(&mut self, peer: Option<RobotId>, reason: &'static str, detail: &str) {
+        if let Some(suppressed) = self.stats.rejected(self.now, peer, reason) {
+            self.event(Event::Rejected { peer, reason: format!("{reason}: {detail}"), suppressed });
+        }
     }
 }

@@ -6,10 +6,15 @@
 //! `∂r/∂δ_i = −J_l⁻¹(r) Ad(t_i_j⁻¹)`. Gauge: the smallest [`SubmapId`] of a component is held fixed.
 
 use crate::geometry::sim3::{self, Matrix7, Vector7};
-use crate::geometry::{Relative, Se3, Sim3, se3};
+use crate::geometry::{Covariance, Relative, Se3, Sim3, se3};
 use crate::ids::{EntryId, FrameId, SubmapId};
+use nalgebra::SMatrix;
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
+
+/// Added to every variance (m², rad²): nobody is surer than a micrometre, and no factor's information dwarfs the others
+/// so far that the factorisation fails.
+const VARIANCE_MIN: f64 = 1e-12;
 
 /// Where a factor comes from; part of the canonical order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -196,9 +201,9 @@ impl Edge {
         let mut information = Matrix7::zeros();
         match &factor.t_i_j {
             Relative::Metric(p) => {
-                information.fixed_view_mut::<6, 6>(0, 0).copy_from(&p.covariance.information());
+                information.fixed_view_mut::<6, 6>(0, 0).copy_from(&information_of(&p.covariance));
             }
-            Relative::Similarity(s) => information = s.covariance.information(),
+            Relative::Similarity(s) => information = information_of(&s.covariance),
         }
         information *= factor.weight;
         Ok(Self { factor, i: a, j: b, information })
@@ -253,6 +258,11 @@ fn linearise_rigid(measured: &Se3, predicted: &Se3) -> Linearised {
     let shrink = se3::join(&-(predicted.rotation.inverse() * predicted.translation), &nalgebra::Vector3::zeros());
     by_j.fixed_view_mut::<6, 1>(0, 6).copy_from(&(j_r_inv * shrink));
     Linearised { residual: lift(&residual), by_i, by_j }
+}
+
+/// The information of a measurement, its certainty bounded by [`VARIANCE_MIN`].
+fn information_of<const N: usize>(covariance: &Covariance<N>) -> SMatrix<f64, N, N> {
+    Covariance::new_or_wider(covariance.matrix() + SMatrix::identity() * VARIANCE_MIN).information()
 }
 
 /// A rigid tangent vector as one of SIM(3).

@@ -6,7 +6,7 @@
 
 use super::solve::Solution;
 use crate::geometry::sim3::{Matrix7, Vector7};
-use crate::geometry::{Covariance, PoseWithCovariance, Relative, Sim3, SimWithCovariance};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
 use crate::ids::{FrameId, SubmapId};
 use nalgebra::Matrix6;
 use std::collections::BTreeSet;
@@ -23,7 +23,7 @@ impl Solution {
         let t_i_j = self.values[a].inverse() * self.values[b];
         let rigid = is_rigid(i.frame, j.frame, unknown_scale);
         if a == b {
-            return Some(certain(Sim3::identity()));
+            return Some(Relative::Metric(certain()));
         }
         relation(t_i_j, self.covariance_between(a, b)?, rigid)
     }
@@ -37,7 +37,7 @@ impl Solution {
         let anchors = self.graph.nodes().iter().enumerate();
         let one = |(k, &id): (usize, &SubmapId)| {
             if k == r {
-                return Some((id, certain(Sim3::identity())));
+                return Some((id, Relative::Metric(certain())));
             }
             let t_r_k = self.values[r].inverse() * self.values[k];
             let variables = self.variables(k);
@@ -136,13 +136,10 @@ impl Solution {
     }
 }
 
-/// An exact relation, with the smallest covariance that can be stated.
-pub(super) fn certain(sim: Sim3) -> Relative {
-    let tiny = Covariance::from_sigmas([SIGMA_CERTAIN; 6]);
-    match tiny {
-        Ok(covariance) => Relative::Metric(PoseWithCovariance { pose: sim.to_se3(), covariance }),
-        Err(_) => unreachable!("1e-9 squared is an accepted variance"),
-    }
+/// The identity, with the smallest covariance that can be stated.
+pub(super) fn certain() -> PoseWithCovariance {
+    let covariance = Covariance::new_or_wider(Matrix6::identity() * (SIGMA_CERTAIN * SIGMA_CERTAIN));
+    PoseWithCovariance { pose: Se3::identity(), covariance }
 }
 
 /// Whether a relation between two frames is rigid.

@@ -2,13 +2,29 @@
 
 pub mod frames;
 pub mod graph;
+mod intake;
+pub mod joint;
+mod loops;
 pub mod marginals;
+mod pairs;
 pub mod residual;
+mod reweight;
 pub mod solve;
 mod sparse;
 pub mod trajectory;
 
+pub use intake::Kind as EdgeKind;
+pub use joint::{
+    AgreedAlignment, EdgeEstimate, FrameChain, JointEstimate, MapProblem, PairEstimate, Unused, solve_map,
+};
+
+#[cfg(test)]
+mod hostile_tests;
+#[cfg(test)]
+mod joint_tests;
 #[cfg(test)]
 mod solve_tests;
 #[cfg(test)]
 mod test_graphs;
+#[cfg(test)]
+mod test_world;

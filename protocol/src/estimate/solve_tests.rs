@@ -1,6 +1,7 @@
 //! The solver against truth, its own covariances, published optima, and hostile input.
 
 use super::graph::{Factor, Graph, GraphError, Label};
+use super::reweight::leave_one_out;
 use super::solve::{Solution, SolveError, solve};
 use super::test_graphs::*;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
@@ -312,4 +313,22 @@ fn published_graphs_reach_their_optimum() {
         eprintln!("{name}: χ² {:.4} after {} iterations", solution.chi2, solution.iterations);
         assert!(solution.converged && (solution.chi2 / optimum - 1.0).abs() < 1e-4, "{name}: {}", solution.chi2);
     }
+}
+
+/// The leave-one-out statistic needs no second solve; here is the second solve.
+#[test]
+fn leave_one_out_equals_the_innovation_against_the_map_without_the_factor() {
+    let (truth, mut factors) = walk(17, 16, false);
+    let entry = crate::ids::EntryId { frame: frame(0), seq: 0 };
+    factors.last_mut().unwrap().label = Label::Alignment(entry);
+    let tested = *factors.last().unwrap();
+    let start = perturbed(17, &truth, 0.02, 0.01);
+    let with = solve(one_component(&truth, factors.clone()), start.clone(), 50).unwrap();
+    factors.pop();
+    let without = solve(one_component(&truth, factors), start, 50).unwrap();
+    let predicted = without.relative(tested.i, tested.j, &BTreeSet::new()).unwrap();
+    let want = predicted.disagreement(&tested.t_i_j).distance_squared;
+    let edge = with.graph().edges().iter().find(|e| e.factor.label == tested.label).unwrap();
+    let (got, dof) = leave_one_out(&with, edge).unwrap();
+    assert!(dof == 6 && (got / want - 1.0).abs() < 0.02, "{got} {want}");
 }

@@ -122,6 +122,14 @@ mod tests {
     }
 
     #[test]
+    fn the_limits_are_the_chi_squared_quantiles() {
+        use statrs::distribution::{ChiSquared, ContinuousCDF};
+        for (freedom, quantile) in [6.0, 7.0].into_iter().zip(CHI2_999) {
+            assert!((ChiSquared::new(freedom).unwrap().cdf(quantile) - 0.999).abs() < 1e-12);
+        }
+    }
+
+    #[test]
     fn honest_pairs_agree_and_displaced_ones_do_not() {
         let mut rng = rng(13);
         let sigma: Covariance<7> = covariance(&mut rng).scaled(0.01);

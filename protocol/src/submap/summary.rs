@@ -15,5 +15,12 @@ pub enum SummaryError {
 }
 impl Summary {
     /// x
+    pub fn encode(&self) -> Vec<u8> { vec![1] }
+    /// x
+    pub fn decode(_: &[u8]) -> Result<Self, SummaryError> { Ok(Self {}) }
+    /// x
+    pub fn similarity(&self, _: &Self) -> f64 { 0.5 }
+
+    /// x
     pub fn of(_f: &Features) -> Self { Self {} }
 }

@@ -1,0 +1,94 @@
+//! The command line. Exit codes: 0, all went well; 1, it did not (a check failed, the agent could not go on); 2, the
+//! command line or the configuration is wrong.
+
+use crate::commands::{check, keys, replay, run, watch};
+use crate::config::FileConfigError;
+use crate::demo::{self, DemoArgs};
+use crate::host::HostError;
+use anyhow::Result;
+use clap::{Parser, Subcommand};
+use std::ffi::OsString;
+use std::io;
+use std::process::ExitCode;
+
+/// Robot swarms that merge their maps with no server.
+///
+/// Each robot runs one agent. Agents find one another with Zenoh, exchange signed facts about their maps, align what
+/// overlaps, and every robot ends with the same merged map.
+#[derive(Debug, Parser)]
+#[command(name = "merganser", version, propagate_version = true, max_term_width = 100)]
+#[command(after_help = "Exit codes: 0 all went well, 1 it did not, 2 the command line or configuration is wrong.\n\
+                        Start with `merganser demo`.")]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The subcommands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Show three robots merging their maps, start to end, on this computer.
+    Demo(DemoArgs),
+    /// Run this robot's agent.
+    Run(run::RunArgs),
+    /// Watch a swarm: a live table, or every message as a line of JSON.
+    Watch(watch::WatchArgs),
+    /// Check a configuration and print what it means.
+    Check(check::CheckArgs),
+    /// Make and show keys.
+    #[command(subcommand)]
+    Keys(keys::KeysCommand),
+    /// Run an agent's journal through the core again and compare the result.
+    Replay(replay::ReplayArgs),
+}
+
+/// Runs the program with these arguments (the program's name first).
+pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let cli = match Cli::try_parse_from(arguments) {
+        Ok(cli) => cli,
+        Err(told) => {
+            let _ = told.print(); // nowhere left to say that it cannot be said
+            return ExitCode::from(u8::try_from(told.exit_code()).unwrap_or(2));
+        }
+    };
+    match dispatch(cli.command) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(error) if is_closed_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            let _ = console::Term::stderr().write_line(&format!("merganser: {}", explain(&error)));
+            ExitCode::from(if is_misconfigured(&error) { 2 } else { 1 })
+        }
+    }
+}
+
+fn dispatch(command: Command) -> Result<bool> {
+    match command {
+        Command::Demo(args) => demo::run(args),
+        Command::Run(args) => run::run(&args),
+        Command::Watch(args) => watch::run(&args),
+        Command::Check(args) => check::run(&args),
+        Command::Keys(command) => keys::run(command),
+        Command::Replay(args) => replay::run(&args),
+    }
+}
+
+/// The error and its causes, on one line; a cause that the line already tells is not told twice.
+fn explain(error: &anyhow::Error) -> String {
+    error.chain().map(ToString::to_string).fold(String::new(), |line, cause| match line {
+        line if line.is_empty() => cause,
+        line if line.contains(&cause) => line,
+        line => format!("{line}: {cause}"),
+    })
+}
+
+fn is_misconfigured(error: &anyhow::Error) -> bool {
+    let host = error.downcast_ref::<HostError>();
+    error.downcast_ref::<FileConfigError>().is_some() || matches!(host, Some(HostError::Config(_)))
+}
+
+/// Whoever read our output has enough of it: `merganser watch --json | head`.
+fn is_closed_pipe(error: &anyhow::Error) -> bool {
+    error.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == io::ErrorKind::BrokenPipe)
+}

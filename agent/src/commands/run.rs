@@ -1,0 +1,174 @@
+//! `merganser run`: one robot's agent, from its configuration to an orderly end on SIGINT or SIGTERM.
+
+use super::{runtime, say};
+use crate::config::FileConfig;
+use crate::driver::Finished;
+use crate::host::{Host, Options};
+use crate::queue::{Drops, Inbox};
+use crate::recording::Recording;
+use crate::telemetry;
+use anyhow::{Context, Result};
+use merganser_protocol::agent::io::{Command, Input};
+use merganser_protocol::time::Stamp;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use tracing::{error, info, warn};
+
+/// Time between two warnings about what was dropped.
+const DROPS_EVERY: Duration = Duration::from_secs(5);
+/// Keyframes read ahead of their time.
+const READ_AHEAD: usize = 4;
+
+/// What `merganser run` can be told.
+#[derive(Clone, Debug, clap::Args)]
+pub struct RunArgs {
+    /// The configuration file.
+    #[arg(long, short, value_name = "FILE")]
+    pub config: PathBuf,
+    /// Feed keyframes of this recording, as if the robot's SLAM sent them.
+    #[arg(long, value_name = "DIR")]
+    pub recording: Option<PathBuf>,
+    /// Feed the recording this many times faster than it was made.
+    #[arg(long, value_name = "X", default_value_t = 1.0, requires = "recording", value_parser = speed)]
+    pub speed: f64,
+    /// Write all inputs to this file, for `merganser replay`.
+    #[arg(long, value_name = "FILE")]
+    pub journal: Option<PathBuf>,
+    /// Begin a new epoch: the robot's SLAM restarted in a new map frame.
+    #[arg(long)]
+    pub new_epoch: bool,
+    /// Seed of the core's random choices; the system's randomness if absent.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+}
+
+fn speed(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(speed) if (1e-3..=1e4).contains(&speed) => Ok(speed),
+        _ => Err("use a number from 0.001 to 10000".into()),
+    }
+}
+
+/// Runs the agent until a signal ends it, then prints the digest of its facts.
+///
+/// # Errors
+/// If the configuration, the store, the core or Zenoh does not let it start.
+pub fn run(args: &RunArgs) -> Result<bool> {
+    let config = FileConfig::load(&args.config)?;
+    telemetry::init(&config.log);
+    let recording = args.recording.as_ref().map(|folder| Recording::open(folder)).transpose()?;
+    let runtime = runtime()?;
+    let finished = runtime.block_on(live(args, config, recording));
+    runtime.shutdown_timeout(Duration::from_millis(200)); // a job that still runs is of no use any more
+    let finished = finished?;
+    say(&format!("digest {}", finished.digest))?;
+    Ok(true)
+}
+
+async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recording>) -> Result<Finished> {
+    let stop = stop_signal()?;
+    if let Some(recording) = &recording {
+        suit(&mut config, recording);
+    }
+    let mut host = Host::start(config, Options { journal: args.journal.clone(), seed: args.seed }).await?;
+    let inbox = host.inbox().clone();
+    let side = [
+        tokio::spawn(tell_drops(inbox.drops.clone())),
+        tokio::spawn(feed(inbox, args.new_epoch, recording, args.speed)),
+    ];
+    let broken = tokio::select! {
+        () = stop => None,
+        error = host.broken() => Some(error),
+    };
+    side.iter().for_each(tokio::task::JoinHandle::abort);
+    match broken {
+        Some(error) => Err(error.into()),
+        None => Ok(host.stop().await?),
+    }
+}
+
+/// A recording knows what suits its sensor; a file that sets any of the core's knobs knows better.
+fn suit(config: &mut FileConfig, recording: &Recording) {
+    if config.core == merganser_protocol::config::Config::default() {
+        config.core = recording.manifest().config.clone();
+    }
+}
+
+/// Completes at the first SIGINT or SIGTERM; a second one ends the process on the spot.
+fn stop_signal() -> Result<impl Future<Output = ()> + Send + 'static> {
+    let mut interrupt = signal(SignalKind::interrupt()).context("cannot listen for signals")?;
+    let mut terminate = signal(SignalKind::terminate()).context("cannot listen for signals")?;
+    let (sender, receiver) = tokio::sync::oneshot::channel();
+    tokio::spawn(async move {
+        let mut next = async || {
+            tokio::select! {
+                _ = interrupt.recv() => "SIGINT",
+                _ = terminate.recv() => "SIGTERM",
+            }
+        };
+        let name = next().await;
+        info!(signal = name, "ending");
+        let _ = sender.send(());
+        next().await;
+        std::process::exit(1);
+    });
+    Ok(async move {
+        let _ = receiver.await;
+    })
+}
+
+async fn tell_drops(drops: Arc<Drops>) {
+    let mut seen = BTreeMap::new();
+    loop {
+        tokio::time::sleep(DROPS_EVERY).await;
+        for line in drops.news(&mut seen) {
+            warn!("{line}");
+        }
+    }
+}
+
+async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recording>, speed: f64) {
+    if new_epoch {
+        inbox.feed(Input::Command(Command::NewEpoch)).await;
+    }
+    if let Some(recording) = recording {
+        play(&inbox, recording, speed).await;
+    }
+}
+
+/// Feeds a recording in its own time, `speed` times faster, and closes the last submap.
+async fn play(inbox: &Inbox, recording: Recording, speed: f64) {
+    let (sender, mut keyframes) = mpsc::channel(READ_AHEAD);
+    let reader = tokio::task::spawn_blocking(move || {
+        for index in 0..recording.len() {
+            if sender.blocking_send(recording.keyframe(index)).is_err() {
+                return; // the agent ends
+            }
+        }
+    });
+    let mut origin: Option<(tokio::time::Instant, Stamp)> = None;
+    let mut fed = 0_u64;
+    while let Some(keyframe) = keyframes.recv().await {
+        let keyframe = match keyframe {
+            Ok(keyframe) => keyframe,
+            Err(reason) => {
+                error!(%reason, "the recording ends here");
+                break;
+            }
+        };
+        let (start, first) = *origin.get_or_insert((tokio::time::Instant::now(), keyframe.stamp));
+        let ahead = keyframe.stamp.secs_since(first) / speed;
+        tokio::time::sleep_until(start + Duration::try_from_secs_f64(ahead).unwrap_or_default()).await;
+        if !inbox.feed(Input::Keyframe(keyframe)).await {
+            return;
+        }
+        fed += 1;
+    }
+    inbox.feed(Input::Command(Command::Flush)).await;
+    info!(keyframes = fed, "recording fed");
+    drop(reader);
+}

@@ -1,0 +1,306 @@
+//! `merganser watch`: a swarm from outside. A live table of what each robot says of itself, or every message that travels
+//! as a line of JSON. It only listens and asks for views: it holds no key and changes nothing.
+
+use super::{runtime, say};
+use crate::config::{LogConfig, LogFormat, ZenohConfig};
+use crate::keys;
+use crate::link::session::{self, Role};
+use crate::telemetry;
+use anyhow::{Context, Result, anyhow};
+use console::{Term, measure_text_width, pad_str, style};
+use merganser_protocol::ids::Name;
+use merganser_protocol::snapshot::{FramesView, PairStatus, PairView, StatusView};
+use merganser_protocol::wire::messages::Message;
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+use zenoh::Session;
+use zenoh::qos::CongestionControl;
+use zenoh::sample::{Sample, SampleKind};
+
+/// Messages that may wait to be printed.
+const WAITING_MAX: usize = 4096;
+/// How long a robot may take to answer.
+const ANSWER_WAIT: Duration = Duration::from_millis(900);
+/// A robot that has not answered for this long is shown as silent.
+const SILENT: Duration = Duration::from_secs(3);
+
+/// What `merganser watch` can be told.
+#[derive(Clone, Debug, clap::Args)]
+pub struct WatchArgs {
+    /// The swarm to watch.
+    #[arg(long, default_value = "demo", value_parser = name)]
+    pub swarm: Name,
+    /// Endpoint of a robot, e.g. tcp/10.0.0.2:7447. May be given more than once.
+    #[arg(long, value_name = "ENDPOINT")]
+    pub connect: Vec<String>,
+    /// Do not look for robots by multicast.
+    #[arg(long)]
+    pub no_multicast: bool,
+    /// Print every message as a line of JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+    /// Stop after so many seconds.
+    #[arg(long = "for", value_name = "SECS")]
+    pub secs: Option<f64>,
+    /// Seconds between two tables.
+    #[arg(long, value_name = "SECS", default_value_t = 1.0, conflicts_with = "json")]
+    pub interval: f64,
+}
+
+fn name(text: &str) -> Result<Name, String> {
+    Name::new(text).map_err(|error| error.to_string())
+}
+
+/// Watches until the time is over or a signal comes; false if nothing was seen at all.
+///
+/// # Errors
+/// If Zenoh does not open or the output cannot be written.
+pub fn run(args: &WatchArgs) -> Result<bool> {
+    telemetry::init(&LogConfig { format: LogFormat::Text, filter: "warn,zenoh=error".into() });
+    let runtime = runtime()?;
+    let seen = runtime.block_on(watch(args));
+    runtime.shutdown_timeout(Duration::from_millis(200));
+    seen
+}
+
+async fn watch(args: &WatchArgs) -> Result<bool> {
+    let zenoh = ZenohConfig { connect: args.connect.clone(), multicast: !args.no_multicast, ..ZenohConfig::default() };
+    zenoh.validate()?;
+    let session = session::open(&zenoh, Role::Onlooker).await?;
+    let end = async {
+        let time = args.secs.map(|secs| Duration::try_from_secs_f64(secs).unwrap_or_default());
+        let time = async { tokio::time::sleep(time.unwrap_or(Duration::MAX)).await };
+        tokio::select! {
+            () = time => {}
+            _ = tokio::signal::ctrl_c() => {}
+        }
+    };
+    let seen = if args.json { messages(&session, &args.swarm, end).await } else { tables(&session, args, end).await };
+    session::close(&session, Duration::from_secs(2)).await;
+    seen
+}
+
+/// Prints every message of the swarm until `end`.
+async fn messages(session: &Session, swarm: &Name, end: impl Future<Output = ()>) -> Result<bool> {
+    let (sender, mut samples) = mpsc::channel(WAITING_MAX);
+    let missed = Arc::new(AtomicU64::new(0));
+    let count = missed.clone();
+    let heard = move |sample: Sample| {
+        if sender.try_send(sample).is_err() {
+            count.fetch_add(1, Relaxed);
+        }
+    };
+    let key = format!("{}/{swarm}/**", keys::PREFIX);
+    let declared = session.declare_subscriber(key).callback(heard).await;
+    let _subscriber = declared.map_err(|error| anyhow!("zenoh refuses the subscription: {error}"))?;
+    let start = Instant::now();
+    let mut end = std::pin::pin!(end);
+    let mut lines = 0_u64;
+    loop {
+        tokio::select! {
+            () = &mut end => break,
+            sample = samples.recv() => {
+                let Some(sample) = sample else { break };
+                say(&describe(&sample, start.elapsed()).to_string())?;
+                lines += 1;
+            }
+        }
+    }
+    if missed.load(Relaxed) > 0 {
+        tracing::warn!(missed = missed.load(Relaxed), "messages came faster than they could be printed");
+    }
+    Ok(lines > 0)
+}
+
+/// A sample as people may want to read it: decoded where we know how, with the reason where it does not decode.
+pub fn describe(sample: &Sample, since_start: Duration) -> Value {
+    let key = sample.key_expr().as_str();
+    let bytes = sample.payload().to_bytes();
+    let mut line = json!({
+        "secs": since_start.as_secs_f64(),
+        "key": key,
+        "encoding": sample.encoding().to_string(),
+        "bytes": bytes.len(),
+    });
+    if sample.kind() == SampleKind::Delete {
+        line["deleted"] = true.into();
+        return line;
+    }
+    let Some((robot, rest)) = keys::split(key) else { return line };
+    line["robot"] = robot.as_str().into();
+    line["channel"] = rest.into();
+    let decoded = if rest.starts_with("view/") {
+        serde_json::from_slice(&bytes).map_err(|error| error.to_string())
+    } else if rest.starts_with("in/") {
+        return line;
+    } else {
+        decode(&bytes)
+    };
+    match decoded {
+        Ok(message) => line["message"] = message,
+        Err(reason) => line["error"] = reason.into(),
+    }
+    line
+}
+
+fn decode(bytes: &[u8]) -> Result<Value, String> {
+    let message = Message::decode(bytes).map_err(|error| error.to_string())?;
+    serde_json::to_value(&message).map_err(|error| error.to_string())
+}
+
+/// What one robot said of itself, last.
+#[derive(Debug, Default)]
+struct Seen {
+    status: Option<(Instant, StatusView)>,
+    pairs: Vec<PairView>,
+}
+
+/// Asks all robots for their views and shows a table, until `end`.
+async fn tables(session: &Session, args: &WatchArgs, end: impl Future<Output = ()>) -> Result<bool> {
+    let term = Term::stdout();
+    let interval =
+        Duration::try_from_secs_f64(args.interval).context("--interval: use a positive number of seconds")?;
+    let mut ticks = tokio::time::interval(interval.max(Duration::from_millis(100)));
+    let mut robots: BTreeMap<Name, Seen> = BTreeMap::new();
+    let mut end = std::pin::pin!(end);
+    let mut drawn = 0;
+    loop {
+        tokio::select! {
+            () = &mut end => break,
+            _ = ticks.tick() => {}
+        }
+        let (statuses, frames) = tokio::join!(
+            ask::<StatusView>(session, &args.swarm, "view/status"),
+            ask::<FramesView>(session, &args.swarm, "view/frames"),
+        );
+        for (robot, status) in statuses {
+            robots.entry(robot).or_default().status = Some((Instant::now(), status));
+        }
+        for (robot, frames) in frames {
+            robots.entry(robot).or_default().pairs = frames.pairs;
+        }
+        let text = draw(&args.swarm, &robots);
+        if term.is_term() {
+            term.clear_last_lines(drawn)?;
+        }
+        drawn = text.lines().count();
+        say(text.trim_end())?;
+    }
+    Ok(!robots.is_empty())
+}
+
+/// The same view of every robot that answers.
+async fn ask<T: DeserializeOwned>(session: &Session, swarm: &Name, view: &str) -> Vec<(Name, T)> {
+    let (sender, mut replies) = mpsc::channel(WAITING_MAX);
+    let asked = session
+        .get(keys::of_all(swarm, view))
+        .congestion_control(CongestionControl::Drop)
+        .timeout(ANSWER_WAIT)
+        .callback(move |reply| {
+            let _ = sender.try_send(reply); // more robots than fit into a table
+        })
+        .await;
+    if let Err(reason) = asked {
+        tracing::debug!(%reason, "nobody was asked");
+        return Vec::new();
+    }
+    let mut views = Vec::new();
+    while let Some(reply) = replies.recv().await {
+        let Ok(sample) = reply.result() else { continue };
+        let robot = keys::split(sample.key_expr().as_str()).map(|(robot, _)| robot);
+        let parsed = serde_json::from_slice(&sample.payload().to_bytes());
+        match (robot, parsed) {
+            (Some(robot), Ok(view)) => views.push((robot, view)),
+            (_, Err(reason)) => tracing::warn!(key = sample.key_expr().as_str(), %reason, "a view of another version?"),
+            (None, _) => {}
+        }
+    }
+    views
+}
+
+fn draw(swarm: &Name, robots: &BTreeMap<Name, Seen>) -> String {
+    let heads = ["robot", "epoch", "neighbours", "keyframes", "submaps", "facts", "set", "pending", "merged with"];
+    let mut rows = vec![heads.map(String::from).to_vec()];
+    for (name, seen) in robots {
+        let Some((when, s)) = &seen.status else { continue };
+        let state = match () {
+            () if when.elapsed() > SILENT => "silent".into(),
+            () if s.receive_only => "store failed".into(),
+            () if s.idle => "idle".into(),
+            () => s.pending.to_string(),
+        };
+        let merged = if s.merged_with.is_empty() { "-".into() } else { s.merged_with.join(" ") };
+        rows.push(vec![
+            name.to_string(),
+            s.epoch.to_string(),
+            s.neighbours.len().to_string(),
+            s.keyframes.to_string(),
+            s.submaps.to_string(),
+            s.entries.to_string(),
+            s.digest.chars().take(8).collect(),
+            state,
+            merged,
+        ]);
+    }
+    let mut text = format!("swarm {swarm}: {}\n", if robots.is_empty() { "no robot answers" } else { "" });
+    lay_out(&mut text, &rows);
+    let mut pairs = BTreeMap::new();
+    for pair in robots.values().flat_map(|seen| &seen.pairs) {
+        let before = pairs.entry((&pair.a, &pair.b)).or_insert(pair);
+        if pair.agreed > before.agreed {
+            *before = pair;
+        }
+    }
+    if !pairs.is_empty() {
+        text.push('\n');
+        let heads = ["pair", "", "proposed", "agreed", "used", "sigma m", "sigma deg"];
+        let mut rows = vec![heads.map(String::from).to_vec()];
+        rows.extend(pairs.into_values().map(pair_row));
+        lay_out(&mut text, &rows);
+    }
+    text
+}
+
+fn pair_row(pair: &PairView) -> Vec<String> {
+    let status = match pair.status {
+        PairStatus::Merged => style("merged").green().to_string(),
+        PairStatus::Provisional => "provisional".into(),
+        PairStatus::Ambiguous => style("ambiguous").yellow().to_string(),
+        PairStatus::Inconsistent => style("inconsistent").red().to_string(),
+    };
+    let norm = |range: std::ops::Range<usize>| {
+        let sigmas = pair.t_a_b.as_ref().and_then(|t| t.sigmas.get(range));
+        sigmas.map(|sigmas| sigmas.iter().map(|s| s * s).sum::<f64>().sqrt())
+    };
+    let show = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.3}"));
+    vec![
+        format!("{} {}", pair.a, pair.b),
+        status,
+        pair.proposed.to_string(),
+        pair.agreed.to_string(),
+        pair.used.to_string(),
+        show(norm(0..3)),
+        show(norm(3..6).map(f64::to_degrees)),
+    ]
+}
+
+/// Appends rows as columns of equal width; the first row is the head.
+fn lay_out(text: &mut String, rows: &[Vec<String>]) {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let width =
+        |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| measure_text_width(cell)).max();
+    let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
+    for (number, row) in rows.iter().enumerate() {
+        let cells: Vec<_> =
+            row.iter().zip(&widths).map(|(cell, w)| pad_str(cell, *w, console::Alignment::Left, None)).collect();
+        let line = cells.join("  ");
+        let line = line.trim_end();
+        let _ = if number == 0 { writeln!(text, "{}", style(line).dim()) } else { writeln!(text, "{line}") }; // a String takes any text
+    }
+}

@@ -1,0 +1,87 @@
+//! The program from outside: its help and its exit codes.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn merganser(arguments: &[&str], folder: &Path) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_merganser")).args(arguments).current_dir(folder).output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+#[test]
+fn the_help_is_the_one_we_reviewed() {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests");
+    let told = merganser(&["--help"], &here);
+    assert_eq!(told.status.code(), Some(0));
+    let kept = here.join("help.txt");
+    if std::env::var_os("UPDATE_HELP").is_some() {
+        std::fs::write(&kept, &told.stdout).unwrap();
+    }
+    let kept = std::fs::read_to_string(kept).unwrap();
+    assert_eq!(text(&told.stdout), kept, "if the change is meant, run again with UPDATE_HELP=1");
+}
+
+#[test]
+fn every_subcommand_has_help_and_every_option_a_text() {
+    let dir = tempfile::tempdir().unwrap();
+    for subcommand in ["demo", "run", "watch", "check", "keys", "replay"] {
+        let told = merganser(&[subcommand, "--help"], dir.path());
+        assert_eq!(told.status.code(), Some(0), "{subcommand}");
+        assert!(text(&told.stdout).contains("Usage: merganser"), "{subcommand}");
+    }
+}
+
+#[test]
+fn exit_codes_tell_usage_from_failure() {
+    let dir = tempfile::tempdir().unwrap();
+    let code = |arguments: &[&str]| merganser(arguments, dir.path()).status.code();
+    assert_eq!(code(&["--version"]), Some(0));
+    assert_eq!(code(&[]), Some(2));
+    assert_eq!(code(&["fly"]), Some(2));
+    assert_eq!(code(&["run"]), Some(2), "without a configuration");
+    assert_eq!(code(&["run", "-c", "none.toml"]), Some(2), "the file is not there");
+    assert_eq!(code(&["run", "-c", "a.toml", "--recording", "r", "--speed", "0"]), Some(2));
+    assert_eq!(code(&["keys", "generate", "--name", "UPPER"]), Some(2));
+    assert_eq!(code(&["keys", "generate", "--name", "alpha"]), Some(0));
+    assert_eq!(code(&["keys", "generate", "--name", "alpha"]), Some(1), "a key is never overwritten");
+}
+
+#[test]
+fn a_generated_key_makes_a_good_configuration() {
+    let dir = tempfile::tempdir().unwrap();
+    let line = text(&merganser(&["keys", "generate", "--name", "alpha"], dir.path()).stdout);
+    let shown = text(&merganser(&["keys", "show", "--name", "alpha", "--key", "alpha.key"], dir.path()).stdout);
+    assert_eq!(line, shown);
+    let default = include_str!("../dist/default.toml");
+    let filled = default.replace("# alpha = \"…\"", line.trim());
+    std::fs::write(dir.path().join("a.toml"), &filled).unwrap();
+    let checked = merganser(&["check", "-c", "a.toml"], dir.path());
+    assert_eq!(checked.status.code(), Some(0), "{}", text(&checked.stderr));
+    assert!(text(&checked.stdout).starts_with("# a.toml: good. Robot alpha of swarm demo"));
+
+    std::fs::write(dir.path().join("a.toml"), filled.replace("queue = 1024", "queues = 1024")).unwrap();
+    let refused = merganser(&["check", "-c", "a.toml"], dir.path());
+    assert_eq!(refused.status.code(), Some(2));
+    let said = text(&refused.stderr);
+    assert!(said.contains("a.toml:") && said.contains("unknown field `queues`"), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+}
+
+/// `dist/default.toml` claims to show the defaults: take every line away that has one, and nothing may change.
+#[test]
+fn the_commented_defaults_are_the_defaults() {
+    use merganser::config::FileConfig;
+    let key = format!("alpha = \"{}\"", merganser::trust::SecretKey::from_bytes([7; 32]).public());
+    let full = include_str!("../dist/default.toml").replace("# alpha = \"…\"", &key);
+    let head: String = full.lines().take_while(|line| !line.starts_with("[store]")).map(|l| format!("{l}\n")).collect();
+    let parse = |text: &str| FileConfig::parse(text, Path::new("default.toml")).unwrap();
+    assert_eq!(parse(&full), parse(&head));
+    let written = toml::to_string(&parse(&full)).unwrap();
+    for line in written.lines().filter(|line| line.contains(" = ") && !line.starts_with("alpha")) {
+        let name = line.split(" = ").next().unwrap();
+        assert!(full.lines().any(|l| l.starts_with(&format!("{name} = "))), "default.toml does not show {name}");
+    }
+}

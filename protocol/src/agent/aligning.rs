@@ -1,0 +1,354 @@
+//! The negotiation at work: candidates are noted as submaps become known, blobs fetched, alignments computed, stated
+//! and verified.
+
+use super::Agent;
+use super::io::{Event, JobId};
+use super::job::{AlignJob, Job, Measured};
+use super::knowledge::{Agreement, Pair, pair_of};
+use super::negotiation::{
+    ALIGNMENTS_PER_FRAME_PAIR, Candidate, FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work,
+};
+use crate::geometry::Relative;
+use crate::ids::{EntryId, FrameId, Hash, SubmapId};
+use crate::submap::Summary;
+use crate::time::Instant;
+use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, SubmapFact, VerdictFact, VerdictOutcome};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Undisputed alignments stated so far, per pair of frames.
+type Stated = BTreeMap<(FrameId, FrameId), usize>;
+
+impl Agent {
+    /// A fact has taken effect: what does it call for?
+    pub(super) fn on_fact(&mut self, id: EntryId, fact: &Fact) {
+        self.negotiation.stir();
+        match fact {
+            Fact::Submap(fact) => self.note_candidates(SubmapId { frame: id.frame, index: fact.index }),
+            Fact::Alignment(fact) => self.note_verification(id, fact),
+            Fact::Verdict(fact) => self.report_agreement(fact.alignment),
+            Fact::Sighting(_) => {}
+        }
+    }
+
+    /// Pairs a submap that became known with all that it may overlap.
+    fn note_candidates(&mut self, new: SubmapId) {
+        let others: Vec<SubmapId> = if new.frame.robot == self.me.robot {
+            self.knowledge.submaps().map(|(id, _)| id).collect()
+        } else {
+            self.knowledge.submaps().map(|(id, _)| id).filter(|id| id.frame.robot == self.me.robot).collect()
+        };
+        for other in others {
+            let (mine, theirs) = if new.frame.robot == self.me.robot { (new, other) } else { (other, new) };
+            if self.may_pair(mine, theirs) {
+                self.note_pair(mine, theirs);
+            }
+        }
+    }
+
+    fn may_pair(&self, mine: SubmapId, theirs: SubmapId) -> bool {
+        let pair = pair_of(mine, theirs);
+        let far = mine.frame != theirs.frame || mine.index.abs_diff(theirs.index) >= LOOP_GAP;
+        far && !self.negotiation.is_tried(pair) && !self.knowledge.is_stated(pair)
+    }
+
+    fn note_pair(&mut self, mine: SubmapId, theirs: SubmapId) {
+        let summary = |id| self.knowledge.submap(id).and_then(|fact: &SubmapFact| Summary::decode(&fact.summary).ok());
+        let (Some(a), Some(b)) = (summary(mine), summary(theirs)) else { return };
+        let similarity = a.similarity(&b);
+        if similarity < self.config.align.similarity_min {
+            return;
+        }
+        let pair = pair_of(mine, theirs);
+        let limit = self.config.align.candidates_max;
+        if Negotiation::responsible(pair) == self.me.robot || mine.frame.robot == theirs.frame.robot {
+            self.negotiation.add_candidate(Candidate { mine, theirs, similarity, wished: false }, limit);
+        } else if self.negotiation.wishes.len() < limit {
+            self.negotiation.wishes.insert(pair, similarity);
+        }
+    }
+
+    /// Somebody aligned one of our submaps: we owe an answer, once.
+    fn note_verification(&mut self, id: EntryId, fact: &AlignmentFact) {
+        self.negotiation.mark_tried((fact.i, fact.j));
+        self.negotiation.wishes.remove(&(fact.i, fact.j));
+        let ours = fact.i.frame.robot == self.me.robot || fact.j.frame.robot == self.me.robot;
+        let owed = ours && id.frame.robot != self.me.robot && !self.knowledge.has_verdict(id, self.me.robot);
+        if owed && self.negotiation.verify.len() < VERIFICATIONS_MAX {
+            self.negotiation.verify.insert(id);
+        }
+    }
+
+    fn report_agreement(&mut self, alignment: EntryId) {
+        let Some(fact) = self.knowledge.alignment(alignment) else { return };
+        let (i, j) = (fact.i, fact.j);
+        if i.frame.robot != self.me.robot && j.frame.robot != self.me.robot {
+            return;
+        }
+        match self.knowledge.agreement(alignment) {
+            Agreement::Agreed => {
+                self.stats.worked("agreed");
+                self.event(Event::AlignmentAgreed { i, j });
+            }
+            Agreement::Disputed => {
+                self.stats.worked("disputed");
+                self.event(Event::AlignmentDisputed { i, j });
+            }
+            Agreement::Waiting => {}
+        }
+    }
+
+    pub(super) fn fetch_timeout(&self) -> Option<Instant> {
+        self.negotiation.fetches.values().filter(|f| f.query.is_none()).map(|f| f.not_before).min()
+    }
+
+    /// Starts as many alignments as allowed: answers owed first, then the most promising candidates.
+    pub(super) fn start_aligning(&mut self) {
+        if self.negotiation.take_stirred() && !self.receive_only {
+            self.start_verifying();
+            self.start_proposing();
+            self.drop_idle_fetches();
+        }
+        self.start_fetching();
+    }
+
+    fn has_room(&self) -> bool {
+        self.negotiation.running.len() < self.config.align.jobs_max
+    }
+
+    fn start_verifying(&mut self) {
+        let owed: Vec<EntryId> = self.negotiation.verify.iter().copied().collect();
+        for id in owed {
+            let Some(fact) = self.knowledge.alignment(id).cloned() else {
+                self.negotiation.verify.remove(&id);
+                continue;
+            };
+            let (mine, theirs) = if fact.i.frame.robot == self.me.robot { (fact.i, fact.j) } else { (fact.j, fact.i) };
+            if !self.blobs_match(&fact) || self.negotiation.features(mine).is_none() {
+                self.negotiation.verify.remove(&id);
+                self.write_verdict(id, VerdictOutcome::Refused(RefusalReason::BadInput));
+            } else if self.has_room() && self.start_alignment(mine, theirs, Purpose::Verify(id)) {
+                self.negotiation.verify.remove(&id);
+            }
+        }
+    }
+
+    /// The alignment names the very blobs that the two submaps' owners stated.
+    fn blobs_match(&self, fact: &AlignmentFact) -> bool {
+        let blob = |id| self.knowledge.submap(id).map(|submap| submap.blob);
+        blob(fact.i) == Some(fact.blobs[0]) && blob(fact.j) == Some(fact.blobs[1])
+    }
+
+    fn start_proposing(&mut self) {
+        if !self.has_room() {
+            return;
+        }
+        for candidate in self.active_candidates() {
+            if !self.has_room() || self.negotiation.fetches.len() >= 2 * FETCHES_MAX {
+                break;
+            }
+            let Candidate { mine, theirs, .. } = candidate;
+            if self.negotiation.features(mine).is_none() {
+                self.negotiation.mark_tried(pair_of(mine, theirs));
+            } else if self.start_alignment(mine, theirs, Purpose::Propose) {
+                self.negotiation.mark_tried(pair_of(mine, theirs));
+            }
+        }
+    }
+
+    /// Candidates worth their cost now, best first.
+    pub(super) fn active_candidates(&self) -> Vec<Candidate> {
+        let stated = self.stated();
+        self.negotiation.ranked(|candidate| self.gain(candidate, &stated))
+    }
+
+    fn stated(&self) -> Stated {
+        let mut stated = Stated::new();
+        for (id, fact) in self.knowledge.alignments() {
+            if self.knowledge.agreement(id) != Agreement::Disputed {
+                *stated.entry((fact.i.frame, fact.j.frame)).or_default() += 1;
+            }
+        }
+        stated
+    }
+
+    /// Expected gain of a pair: unmerged frames first, then similarity; nothing where the joint estimate says that the
+    /// two submaps cannot touch, or where the two frames are tied together well enough.
+    fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
+        let (a, b) = pair_of(candidate.mine, candidate.theirs);
+        if stated.get(&(a.frame, b.frame)).is_some_and(|&n| n >= ALIGNMENTS_PER_FRAME_PAIR) {
+            return None;
+        }
+        let wish = if candidate.wished { 0.5 } else { 0.0 };
+        match self.distance(a, b) {
+            None => Some(1.0 + candidate.similarity + wish),
+            Some(distance) if distance <= self.reach(a) + self.reach(b) => Some(candidate.similarity + wish),
+            Some(_) => None,
+        }
+    }
+
+    /// Distance between two anchors by the joint estimate, if they are connected.
+    fn distance(&self, a: SubmapId, b: SubmapId) -> Option<f64> {
+        let position = |id| self.map.anchors.get(&id).map(|t: &Relative| t.sim().translation);
+        Some((position(a)? - position(b)?).norm())
+    }
+
+    /// How far from its anchor a submap may still overlap another: half its extent.
+    fn reach(&self, id: SubmapId) -> f64 {
+        let [x, y, z] = self.knowledge.submap(id).map_or([0.0; 3], |fact| fact.extent).map(f64::from);
+        0.5 * (x * x + y * y + z * z).sqrt()
+    }
+
+    /// Starts aligning a pair, if the other side's keypoints are here; otherwise has them fetched.
+    fn start_alignment(&mut self, mine: SubmapId, theirs: SubmapId, purpose: Purpose) -> bool {
+        let Some(fact) = self.knowledge.submap(theirs) else { return false };
+        let (blob, scale) = (fact.blob, fact.scale);
+        let Some(keypoints) = self.negotiation.keypoints(blob).cloned() else {
+            let fetch = Fetch { owner: theirs.frame.robot, query: None, failures: 0, not_before: self.now };
+            self.negotiation.fetches.entry(blob).or_insert(fetch);
+            return false;
+        };
+        let Some(features) = self.negotiation.features(mine).cloned() else { return false };
+        let own_scale = self.config.submap.scale;
+        let job = AlignJob {
+            theirs: keypoints,
+            mine: features,
+            config: self.config.align.clone(),
+            voxel_m: self.config.submap.voxel_m,
+            scale: if own_scale == ScaleKind::Metric { scale } else { ScaleKind::Unknown },
+            seed: self.pair_seed(pair_of(mine, theirs)),
+        };
+        let id = self.run_job(Job::Align(Box::new(job)));
+        self.negotiation.running.insert(id, Work { mine, theirs, purpose });
+        true
+    }
+
+    /// A seed of our own for this pair: independent of the other endpoint's, the same in a replay.
+    fn pair_seed(&self, pair: Pair) -> u64 {
+        let mut bytes = Vec::with_capacity(80);
+        bytes.extend_from_slice(&self.me.robot.0);
+        for id in [pair.0, pair.1] {
+            bytes.extend_from_slice(&id.frame.robot.0);
+            bytes.extend_from_slice(&id.frame.epoch.to_le_bytes());
+            bytes.extend_from_slice(&id.index.to_le_bytes());
+        }
+        let Hash(hash) = Hash::of(&bytes);
+        let [a, b, c, d, e, f, g, h, ..] = hash;
+        u64::from_le_bytes([a, b, c, d, e, f, g, h]) ^ self.seed
+    }
+
+    /// Stops fetching what no pair needs any more.
+    fn drop_idle_fetches(&mut self) {
+        let mut wanted: BTreeSet<SubmapId> = self.active_candidates().iter().map(|c| c.theirs).collect();
+        for id in &self.negotiation.verify {
+            wanted.extend(self.knowledge.alignment(*id).into_iter().flat_map(|fact| [fact.i, fact.j]));
+        }
+        let blobs: BTreeSet<Hash> =
+            wanted.into_iter().filter_map(|id| self.knowledge.submap(id)).map(|fact| fact.blob).collect();
+        self.negotiation.fetches.retain(|hash, fetch| fetch.query.is_some() || blobs.contains(hash));
+    }
+
+    fn start_fetching(&mut self) {
+        let due: Vec<(Hash, Fetch)> = self
+            .negotiation
+            .fetches
+            .iter()
+            .filter(|(_, fetch)| fetch.query.is_none() && fetch.not_before <= self.now)
+            .map(|(hash, fetch)| (*hash, *fetch))
+            .collect();
+        let mut free =
+            FETCHES_MAX.saturating_sub(self.negotiation.fetches.values().filter(|f| f.query.is_some()).count());
+        for (hash, fetch) in due {
+            let peer = self.holder(&fetch);
+            if free == 0 || peer.is_none() {
+                // Nobody to ask, or enough under way: look again a little later, not at once.
+                let later = self.now.after(core::time::Duration::from_millis(500));
+                self.negotiation.fetches.entry(hash).and_modify(|fetch| fetch.not_before = later);
+                continue;
+            }
+            if let Some(peer) = peer {
+                free -= 1;
+                let query = self.fetch_blob(hash, peer);
+                self.negotiation.fetches.entry(hash).and_modify(|fetch| fetch.query = Some(query));
+            }
+        }
+    }
+
+    /// Whom to ask for a blob: its owner, or after failures any neighbour in turn (whoever fetched it has it).
+    fn holder(&self, fetch: &Fetch) -> Option<crate::ids::RobotId> {
+        let neighbours = &self.gossip.neighbours;
+        let turn = fetch.failures as usize;
+        if turn.is_multiple_of(2) && neighbours.contains(&fetch.owner) {
+            return Some(fetch.owner);
+        }
+        neighbours.iter().nth((turn / 2) % neighbours.len().max(1)).copied()
+    }
+
+    pub(super) fn on_aligned(&mut self, job: JobId, outcome: Result<Box<Measured>, RefusalReason>) {
+        let Some(work) = self.negotiation.running.remove(&job) else { return };
+        self.negotiation.stir();
+        self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
+        match work.purpose {
+            Purpose::Propose => {
+                if let Ok(measured) = outcome {
+                    self.propose(&work, &measured);
+                }
+            }
+            Purpose::Verify(id) => {
+                let verdict = match outcome {
+                    Ok(measured) => VerdictOutcome::Measured {
+                        t_i_j: t_i_j(&work, &measured.t_mine_theirs),
+                        sigma: measured.sigma as f32,
+                        support: to_support(measured.support),
+                    },
+                    Err(reason) => VerdictOutcome::Refused(reason),
+                };
+                self.write_verdict(id, verdict);
+            }
+        }
+    }
+
+    fn propose(&mut self, work: &Work, measured: &Measured) {
+        let (i, j) = pair_of(work.mine, work.theirs);
+        let blob = |id| self.knowledge.submap(id).map(|fact| fact.blob);
+        let (Some(blob_i), Some(blob_j)) = (blob(i), blob(j)) else { return };
+        self.event(Event::AlignmentProposed { i, j, support: measured.support });
+        let fact = Fact::Alignment(AlignmentFact {
+            i,
+            j,
+            t_i_j: t_i_j(work, &measured.t_mine_theirs),
+            sigma: measured.sigma as f32,
+            support: to_support(measured.support),
+            log10_nfa: measured.log10_nfa as f32,
+            blobs: [blob_i, blob_j],
+        });
+        self.write(self.me.frame.epoch, &fact);
+    }
+
+    fn write_verdict(&mut self, alignment: EntryId, outcome: VerdictOutcome) {
+        self.write(self.me.frame.epoch, &Fact::Verdict(VerdictFact { alignment, outcome }));
+    }
+
+    /// The most similar pair that the other endpoint should try and that would join frames not yet merged.
+    pub(super) fn best_wish(&mut self) -> Option<Pair> {
+        let reachable =
+            |pair: &Pair| [pair.0, pair.1].iter().any(|id| self.gossip.neighbours.contains(&id.frame.robot));
+        let best = self
+            .negotiation
+            .wishes
+            .iter()
+            .filter(|(pair, _)| reachable(pair) && self.distance(pair.0, pair.1).is_none())
+            .max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0)))
+            .map(|(pair, _)| *pair)?;
+        self.negotiation.wishes.remove(&best);
+        Some(best)
+    }
+}
+
+/// The measurement in the canonical direction: target the smaller submap.
+fn t_i_j(work: &Work, t_mine_theirs: &Relative) -> Relative {
+    if work.mine < work.theirs { *t_mine_theirs } else { t_mine_theirs.inverse() }
+}
+
+fn to_support(support: f64) -> u16 {
+    support.clamp(0.0, f64::from(u16::MAX)) as u16
+}

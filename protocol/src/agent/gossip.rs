@@ -1,0 +1,351 @@
+//! How facts spread (DESIGN §4): new entries are published once; root hashes are announced at intervals; a neighbour
+//! whose root differs is asked for what we lack, by have-vector. Blobs are fetched on demand from whoever may have
+//! them. Pose beacons are hints: best effort, latest wins, never facts.
+
+use super::Agent;
+use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
+use super::knowledge::{Pair, pair_of};
+use crate::ids::{EntryId, Hash, RobotId, SubmapId};
+use crate::time::Instant;
+use crate::wire::limits::BLOB_LEN_MAX;
+use crate::wire::messages::{AlignStatus, Message};
+use crate::wire::{Beacon, BeaconContent, HaveRoot};
+use core::time::Duration;
+use rand::RngExt;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Raw blobs kept in memory to serve others.
+pub const BLOBS_MAX: usize = 2_048;
+/// Shortest time between two wishes ([`Message::AlignRequest`]).
+const WISH_EVERY: Duration = Duration::from_secs(2);
+
+/// What the gossip remembers.
+pub(super) struct Gossip {
+    pub(super) neighbours: BTreeSet<RobotId>,
+    beacons: BTreeMap<RobotId, SeenBeacon>,
+    blobs: BTreeMap<Hash, Vec<u8>>,
+    questions: BTreeMap<QueryId, Question>,
+    syncing: BTreeMap<RobotId, QueryId>,
+    next_have: Instant,
+    next_pose: Instant,
+    next_wish: Instant,
+    beacon_counter: u64,
+    have_tick: u64,
+}
+
+/// The latest beacon of a robot.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SeenBeacon {
+    pub(super) content: BeaconContent,
+    pub(super) at: Instant,
+}
+
+/// A question of ours under way.
+#[derive(Clone, Copy, Debug)]
+struct Question {
+    peer: RobotId,
+    about: About,
+    expires: Instant,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum About {
+    Sync,
+    Blob(Hash),
+    Align,
+}
+
+impl Gossip {
+    pub(super) fn new(now: Instant) -> Self {
+        Self {
+            neighbours: BTreeSet::new(),
+            beacons: BTreeMap::new(),
+            blobs: BTreeMap::new(),
+            questions: BTreeMap::new(),
+            syncing: BTreeMap::new(),
+            next_have: now,
+            next_pose: now,
+            next_wish: now,
+            beacon_counter: 0,
+            have_tick: 0,
+        }
+    }
+
+    pub(super) fn beacon(&self, robot: RobotId) -> Option<&SeenBeacon> {
+        self.beacons.get(&robot)
+    }
+
+    pub(super) fn beacons(&self) -> impl Iterator<Item = (RobotId, &SeenBeacon)> {
+        self.beacons.iter().map(|(robot, seen)| (*robot, seen))
+    }
+
+    pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>) {
+        if self.blobs.len() >= BLOBS_MAX && !self.blobs.contains_key(&hash) {
+            self.blobs.pop_first();
+        }
+        self.blobs.insert(hash, bytes);
+    }
+}
+
+impl Agent {
+    pub(super) fn gossip_timeout(&self) -> Option<Instant> {
+        Some(self.gossip.next_have.min(self.gossip.next_pose))
+    }
+
+    pub(super) fn run_timers(&mut self) {
+        if self.now >= self.gossip.next_have {
+            self.announce();
+        }
+        if self.now >= self.gossip.next_pose {
+            self.gossip.next_pose = self.now.after(Duration::from_secs_f64(self.config.gossip.pose_secs));
+            self.publish_pose();
+        }
+        if self.now >= self.gossip.next_wish {
+            self.gossip.next_wish = self.now.after(WISH_EVERY);
+            self.send_wish();
+        }
+        self.expire_questions();
+    }
+
+    /// Publishes the root hash; a little jitter keeps a swarm that started together from speaking together.
+    fn announce(&mut self) {
+        let jitter = self.rng.random_range(0.9..1.1);
+        self.gossip.next_have = self.now.after(Duration::from_secs_f64(self.config.gossip.have_secs * jitter));
+        if self.gossip.neighbours.is_empty() {
+            return;
+        }
+        self.gossip.have_tick += 1;
+        let (robot, root, count) = (self.me.robot, self.replica.root(), self.replica.count());
+        let root = HaveRoot { robot, root, count, tick: self.gossip.have_tick };
+        self.publish(Channel::Have, &Message::Have(root));
+    }
+
+    fn publish_pose(&mut self) {
+        if self.gossip.neighbours.is_empty() {
+            return;
+        }
+        let Some((index, t_anchor_body, stamp)) = self.mapper.body() else { return };
+        self.gossip.beacon_counter += 1;
+        let anchor = SubmapId { frame: self.me.frame, index };
+        let counter = self.gossip.beacon_counter;
+        let content = BeaconContent { anchor, stamp, counter, t_anchor_body };
+        match Beacon::sign(&self.me.key, self.replica.swarm(), &content) {
+            Ok(beacon) => self.publish(Channel::Pose, &Message::Pose(beacon)),
+            Err(error) => self.reject(Some(self.me.robot), "own pose", &error.to_string()),
+        }
+    }
+
+    /// Publishes entries of ours that just became durable.
+    pub(super) fn publish_entries(&mut self, ids: &[EntryId]) {
+        if self.gossip.neighbours.is_empty() {
+            return; // Nobody listens; whoever comes will sync.
+        }
+        let entries: Vec<Vec<u8>> =
+            ids.iter().filter_map(|id| self.replica.entry_bytes(*id).map(<[u8]>::to_vec)).collect();
+        for message in Message::facts(entries) {
+            self.publish(Channel::Facts, &message);
+        }
+    }
+
+    fn publish(&mut self, channel: Channel, message: &Message) {
+        let bytes = message.encode();
+        self.stats.sent(message.kind(), bytes.len());
+        self.outputs.push_back(Output::Publish { channel, bytes });
+    }
+
+    fn ask(&mut self, peer: RobotId, kind: QueryKind, message: &Message, about: About) -> QueryId {
+        let query = self.new_query();
+        let bytes = message.encode();
+        self.stats.sent(message.kind(), bytes.len());
+        let expires = self.now.after(Duration::from_secs_f64(3.0 * self.config.gossip.answer_secs));
+        self.gossip.questions.insert(query, Question { peer, about, expires });
+        self.outputs.push_back(Output::Ask { query, peer, kind, bytes });
+        query
+    }
+
+    pub(super) fn on_neighbour(&mut self, robot: RobotId, up: bool) {
+        if robot == self.me.robot || self.replica.name_of(robot).is_none() {
+            return;
+        }
+        if !up {
+            self.gossip.neighbours.remove(&robot);
+        } else if self.gossip.neighbours.insert(robot) {
+            self.gossip.next_have = self.now; // Contact: compare at once.
+        }
+    }
+
+    pub(super) fn on_received(&mut self, from: RobotId, channel: Channel, bytes: &[u8]) {
+        let message = match Message::decode(bytes) {
+            Ok(message) => message,
+            Err(error) => return self.reject(Some(from), error.reason(), &error.to_string()),
+        };
+        self.stats.received(message.kind(), bytes.len());
+        match (channel, message) {
+            (Channel::Pose, Message::Pose(beacon)) => self.on_beacon(from, &beacon),
+            (Channel::Facts, Message::Facts(entries)) => {
+                for entry in &entries {
+                    self.ingest(Some(from), &entry.0);
+                }
+            }
+            (Channel::Have, Message::Have(have)) => self.on_have(from, &have),
+            (_, other) => self.reject(Some(from), "wrong channel", other.kind()),
+        }
+    }
+
+    fn on_beacon(&mut self, from: RobotId, beacon: &Beacon) {
+        if !self.replica.verify_beacon(beacon) {
+            return self.reject(Some(from), "pose: signature", "beacon not signed by the robot it names");
+        }
+        let robot = beacon.robot();
+        let newer = self.gossip.beacons.get(&robot).is_none_or(|seen| {
+            let age = |content: &BeaconContent| (content.anchor.frame.epoch, content.counter);
+            age(beacon) > age(&seen.content)
+        });
+        if newer && robot != self.me.robot {
+            self.gossip.beacons.insert(robot, SeenBeacon { content: **beacon, at: self.now });
+        }
+    }
+
+    /// A neighbour holds another set: ask it for what we lack. (It asks us in turn when it hears our root.)
+    fn on_have(&mut self, from: RobotId, have: &HaveRoot) {
+        let peer = have.robot;
+        if peer != from || self.replica.name_of(peer).is_none() {
+            return self.reject(Some(from), "have: wrong sender", "root hash under another robot's key");
+        }
+        if self.replica.differs(have) {
+            self.sync_with(peer);
+        }
+    }
+
+    fn sync_with(&mut self, peer: RobotId) {
+        // While received entries wait for the disk our vector is stale: asking now would fetch them twice.
+        if self.gossip.syncing.contains_key(&peer) || !self.ledger.waiting.is_empty() || !self.ledger.open.is_empty() {
+            return;
+        }
+        let vector = Message::SyncRequest(self.replica.have());
+        let query = self.ask(peer, QueryKind::Sync, &vector, About::Sync);
+        self.gossip.syncing.insert(peer, query);
+    }
+
+    pub(super) fn fetch_blob(&mut self, hash: Hash, peer: RobotId) -> QueryId {
+        let request = Message::BlobRequest { hash, offset: 0, len: BLOB_LEN_MAX as u32 };
+        self.ask(peer, QueryKind::Blob, &request, About::Blob(hash))
+    }
+
+    fn send_wish(&mut self) {
+        let Some(pair) = self.best_wish() else { return };
+        let peer = if pair.0.frame.robot == self.me.robot { pair.1.frame.robot } else { pair.0.frame.robot };
+        let request = Message::AlignRequest { i: pair.0, j: pair.1 };
+        self.ask(peer, QueryKind::Align, &request, About::Align);
+    }
+
+    pub(super) fn on_answered(&mut self, query: QueryId, bytes: Option<&[u8]>) {
+        let Some(question) = self.gossip.questions.remove(&query) else { return };
+        if matches!(question.about, About::Sync) {
+            self.gossip.syncing.remove(&question.peer);
+        }
+        let answer = match bytes.filter(|bytes| !bytes.is_empty()).map(Message::decode) {
+            None => None,
+            Some(Ok(message)) => Some(message),
+            Some(Err(error)) => {
+                self.reject(Some(question.peer), error.reason(), &error.to_string());
+                None
+            }
+        };
+        if let (Some(message), Some(bytes)) = (&answer, bytes) {
+            self.stats.received(message.kind(), bytes.len());
+        }
+        match (question.about, answer) {
+            (About::Sync, Some(Message::SyncReply(delta))) => {
+                for entry in &delta.entries {
+                    self.ingest(Some(question.peer), &entry.0);
+                }
+                for proof in &delta.forks {
+                    self.ingest_fork(question.peer, proof);
+                }
+            }
+            (About::Blob(hash), Some(Message::BlobReply { hash: got, bytes, .. })) if got == hash => {
+                self.on_blob(query, question.peer, hash, bytes);
+            }
+            (About::Blob(_), _) => self.negotiation.fetch_failed(query, self.now),
+            (About::Sync | About::Align, _) => {}
+        }
+    }
+
+    fn on_blob(&mut self, query: QueryId, peer: RobotId, hash: Hash, bytes: Vec<u8>) {
+        if Hash::of(&bytes) == hash {
+            self.keep_blob(bytes);
+        } else {
+            self.reject(Some(peer), "blob: wrong hash", "the bytes are not those the hash names");
+        }
+        if self.negotiation.keypoints(hash).is_some() {
+            self.negotiation.fetches.remove(&hash);
+        } else {
+            self.negotiation.fetch_failed(query, self.now);
+        }
+    }
+
+    /// Every question is answered exactly once; an empty answer says "I cannot".
+    pub(super) fn on_asked(&mut self, token: AskToken, kind: QueryKind, bytes: &[u8]) {
+        let answer = match Message::decode(bytes) {
+            Ok(message) => {
+                self.stats.received(message.kind(), bytes.len());
+                self.answer(kind, message)
+            }
+            Err(error) => {
+                self.reject(None, error.reason(), &error.to_string());
+                None
+            }
+        };
+        let bytes = answer.map_or_else(Vec::new, |message| {
+            let bytes = message.encode();
+            self.stats.sent(message.kind(), bytes.len());
+            bytes
+        });
+        self.outputs.push_back(Output::Answer { token, bytes });
+    }
+
+    fn answer(&mut self, kind: QueryKind, question: Message) -> Option<Message> {
+        match (kind, question) {
+            (QueryKind::Sync, Message::SyncRequest(have)) => {
+                Some(Message::SyncReply(self.replica.delta_for(&have, self.config.gossip.delta_bytes_max)))
+            }
+            (QueryKind::Blob, Message::BlobRequest { hash, offset, len }) => {
+                let blob = self.gossip.blobs.get(&hash)?;
+                let start = (offset as usize).min(blob.len());
+                let end = start.saturating_add(len as usize).min(blob.len());
+                let bytes = blob.get(start..end)?.to_vec();
+                Some(Message::BlobReply { hash, offset, total: blob.len() as u32, bytes })
+            }
+            (QueryKind::Align, Message::AlignRequest { i, j }) => {
+                let pair = pair_of(i, j);
+                Some(Message::AlignReply { status: self.wished(pair) })
+            }
+            (_, other) => {
+                self.reject(None, "wrong question", other.kind());
+                None
+            }
+        }
+    }
+
+    fn wished(&mut self, pair: Pair) -> AlignStatus {
+        if self.knowledge.is_stated(pair) {
+            AlignStatus::Done
+        } else if self.negotiation.wish(pair) {
+            AlignStatus::Accepted
+        } else if self.negotiation.is_tried(pair) {
+            AlignStatus::Done
+        } else {
+            AlignStatus::Unknown
+        }
+    }
+
+    /// Shells answer every question; should one fail to, it must not block us for ever.
+    fn expire_questions(&mut self) {
+        let expired: Vec<QueryId> =
+            self.gossip.questions.iter().filter(|(_, q)| self.now >= q.expires).map(|(query, _)| *query).collect();
+        for query in expired {
+            self.on_answered(query, None);
+        }
+    }
+}

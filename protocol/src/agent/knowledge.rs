@@ -1,0 +1,203 @@
+//! What the facts say, independent of the order they came in: the submaps, which alignments both endpoints agree on
+//! (the two-sided rule, DESIGN §3), and the estimation problem that follows from them.
+
+use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
+use crate::geometry::Relative;
+use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
+use crate::wire::fact::{AlignmentFact, Fact, SightingFact, SubmapFact, VerdictFact, VerdictOutcome};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// χ² 99.9 % quantiles for 6 and 7 degrees of freedom: two independent alignments of one pair agree below these.
+const CHI2_6_999: f64 = 22.457_744_484_825_32;
+const CHI2_7_999: f64 = 24.321_886_347_856_85;
+
+/// A pair of submaps, the smaller first.
+pub type Pair = (SubmapId, SubmapId);
+
+/// The pair of `a` and `b`, in canonical order.
+pub fn pair_of(a: SubmapId, b: SubmapId) -> Pair {
+    if a < b { (a, b) } else { (b, a) }
+}
+
+/// How far the two endpoints of an alignment are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Agreement {
+    /// The other endpoint has not answered.
+    Waiting,
+    /// Both measured it and the measurements agree (or one robot owns both ends).
+    Agreed,
+    /// The other endpoint refused, or measured something else.
+    Disputed,
+}
+
+/// All facts held, parsed and indexed.
+#[derive(Clone, Debug, Default)]
+pub struct Knowledge {
+    submaps: BTreeMap<SubmapId, (EntryId, SubmapFact)>,
+    alignments: BTreeMap<EntryId, AlignmentFact>,
+    by_pair: BTreeMap<Pair, BTreeSet<EntryId>>,
+    verdicts: BTreeMap<EntryId, BTreeMap<EntryId, VerdictFact>>,
+    sightings: BTreeMap<EntryId, SightingFact>,
+}
+
+impl Knowledge {
+    /// Takes one fact. Facts that contradict the rules (an alignment by a third party, of a submap with itself) are
+    /// ignored: they are signed, so they stay in the log as evidence, but they move nothing.
+    pub fn absorb(&mut self, id: EntryId, fact: Fact) {
+        match fact {
+            Fact::Submap(submap) => self.absorb_submap(id, submap),
+            Fact::Alignment(alignment) => self.absorb_alignment(id, alignment),
+            Fact::Verdict(verdict) => {
+                self.verdicts.entry(verdict.alignment).or_default().insert(id, verdict);
+            }
+            Fact::Sighting(sighting) => {
+                let known = sighting.i.frame.robot == id.frame.robot && sighting.j.frame.robot != id.frame.robot;
+                if known {
+                    self.sightings.insert(id, sighting);
+                }
+            }
+        }
+    }
+
+    /// Of two submaps that claim one index, the one written first counts, in whatever order they arrive.
+    fn absorb_submap(&mut self, id: EntryId, fact: SubmapFact) {
+        let submap = SubmapId { frame: id.frame, index: fact.index };
+        if self.submaps.get(&submap).is_none_or(|(first, _)| id < *first) {
+            self.submaps.insert(submap, (id, fact));
+        }
+    }
+
+    fn absorb_alignment(&mut self, id: EntryId, fact: AlignmentFact) {
+        let writer = id.frame.robot;
+        let endpoint = fact.i.frame.robot == writer || fact.j.frame.robot == writer;
+        if endpoint && fact.i < fact.j {
+            self.by_pair.entry((fact.i, fact.j)).or_default().insert(id);
+            self.alignments.insert(id, fact);
+        }
+    }
+
+    /// Every submap known.
+    pub fn submaps(&self) -> impl Iterator<Item = (SubmapId, &SubmapFact)> {
+        self.submaps.iter().map(|(id, (_, fact))| (*id, fact))
+    }
+
+    /// One submap.
+    pub fn submap(&self, id: SubmapId) -> Option<&SubmapFact> {
+        self.submaps.get(&id).map(|(_, fact)| fact)
+    }
+
+    /// Every alignment stated.
+    pub fn alignments(&self) -> impl Iterator<Item = (EntryId, &AlignmentFact)> {
+        self.alignments.iter().map(|(id, fact)| (*id, fact))
+    }
+
+    /// One alignment.
+    pub fn alignment(&self, id: EntryId) -> Option<&AlignmentFact> {
+        self.alignments.get(&id)
+    }
+
+    /// Whether anyone stated an alignment of this pair.
+    pub fn is_stated(&self, pair: Pair) -> bool {
+        self.by_pair.contains_key(&pair)
+    }
+
+    /// Whether `robot` has answered this alignment.
+    pub fn has_verdict(&self, alignment: EntryId, robot: RobotId) -> bool {
+        self.verdicts.get(&alignment).is_some_and(|all| all.keys().any(|id| id.frame.robot == robot))
+    }
+
+    /// What the two endpoints make of an alignment.
+    pub fn agreement(&self, id: EntryId) -> Agreement {
+        let Some(fact) = self.alignments.get(&id) else { return Agreement::Waiting };
+        if fact.i.frame.robot == fact.j.frame.robot {
+            return Agreement::Agreed;
+        }
+        match self.verdict(id, fact).map(|verdict| &verdict.outcome) {
+            None => Agreement::Waiting,
+            Some(VerdictOutcome::Refused(_)) => Agreement::Disputed,
+            Some(VerdictOutcome::Measured { t_i_j, .. }) if agree(&fact.t_i_j, t_i_j) => Agreement::Agreed,
+            Some(VerdictOutcome::Measured { .. }) => Agreement::Disputed,
+        }
+    }
+
+    /// The first verdict that the endpoint other than the writer wrote.
+    fn verdict(&self, id: EntryId, fact: &AlignmentFact) -> Option<&VerdictFact> {
+        let writer = id.frame.robot;
+        let other = if fact.i.frame.robot == writer { fact.j.frame.robot } else { fact.i.frame.robot };
+        let all = self.verdicts.get(&id)?;
+        all.iter().find(|(verdict, _)| verdict.frame.robot == other).map(|(_, fact)| fact)
+    }
+
+    /// The measurement that enters the estimate for an agreed alignment: the writer's mean, with the larger (by
+    /// determinant) of the two endpoints' covariances, so that no single endpoint can overstate its certainty.
+    fn measurement(&self, id: EntryId, fact: &AlignmentFact) -> Relative {
+        let Some(VerdictOutcome::Measured { t_i_j, .. }) = self.verdict(id, fact).map(|v| &v.outcome) else {
+            return fact.t_i_j;
+        };
+        match (fact.t_i_j, t_i_j) {
+            (Relative::Metric(mut mine), Relative::Metric(theirs)) => {
+                if theirs.covariance.matrix().determinant() > mine.covariance.matrix().determinant() {
+                    mine.covariance = theirs.covariance;
+                }
+                Relative::Metric(mine)
+            }
+            (Relative::Similarity(mut mine), Relative::Similarity(theirs)) => {
+                if theirs.covariance.matrix().determinant() > mine.covariance.matrix().determinant() {
+                    mine.covariance = theirs.covariance;
+                }
+                Relative::Similarity(mine)
+            }
+            (mine, _) => mine,
+        }
+    }
+
+    /// The estimation problem: every frame's unbroken chain of submaps, one agreed alignment per pair, all sightings.
+    pub fn problem(&self) -> MapProblem {
+        let mut frames: BTreeMap<FrameId, FrameChain> = BTreeMap::new();
+        for (id, (_, fact)) in &self.submaps {
+            let chain =
+                frames.entry(id.frame).or_insert_with(|| FrameChain { scale: fact.scale, odometry: Vec::new() });
+            if chain.odometry.len() == id.index as usize {
+                chain.odometry.push(fact.odometry);
+            }
+        }
+        frames.retain(|_, chain| !chain.odometry.is_empty());
+        let held = |id: SubmapId| frames.get(&id.frame).is_some_and(|c| (id.index as usize) < c.odometry.len());
+        let alignments = self
+            .by_pair
+            .iter()
+            .filter(|((i, j), _)| held(*i) && held(*j))
+            .filter_map(|(_, ids)| ids.iter().find(|id| self.agreement(**id) == Agreement::Agreed))
+            .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
+            .map(|(entry, fact)| AgreedAlignment { entry, i: fact.i, j: fact.j, t_i_j: self.measurement(entry, fact) })
+            .collect();
+        let sightings = self
+            .sightings
+            .iter()
+            .filter(|(_, fact)| held(fact.i) && held(fact.j))
+            .map(|(entry, fact)| AgreedAlignment {
+                entry: *entry,
+                i: fact.i,
+                j: fact.j,
+                t_i_j: Relative::Metric(fact.t_i_j),
+            })
+            .collect();
+        MapProblem { frames, alignments, sightings }
+    }
+}
+
+/// Whether two independent measurements of one relative pose agree: d² of their difference under the sum of their
+/// covariances, χ² at 99.9 %.
+fn agree(a: &Relative, b: &Relative) -> bool {
+    match (a, b) {
+        (Relative::Metric(a), Relative::Metric(b)) => {
+            let sum = a.covariance.plus(&b.covariance);
+            sum.mahalanobis_squared(&a.pose.local(&b.pose)) <= CHI2_6_999
+        }
+        (Relative::Similarity(a), Relative::Similarity(b)) => {
+            let sum = a.covariance.plus(&b.covariance);
+            sum.mahalanobis_squared(&a.sim.local(&b.sim)) <= CHI2_7_999
+        }
+        _ => false,
+    }
+}

@@ -1,0 +1,297 @@
+//! Which pairs of submaps are worth aligning, in what order, and who begins (DESIGN §6).
+//!
+//! A hash of the pair decides the responsible endpoint, so exactly one begins. Candidates are ranked by expected gain:
+//! pairs of frames that are not merged yet first, then by similarity of the summaries. Pairs that the joint estimate
+//! places out of reach of one another, and frame pairs that already have [`ALIGNMENTS_PER_FRAME_PAIR`] alignments, stay
+//! dormant. Every pair is tried once; every foreign alignment that names us is verified once.
+
+use super::io::{JobId, QueryId};
+use super::knowledge::{Pair, pair_of};
+use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
+use crate::submap::{Features, Keypoints};
+use crate::time::Instant;
+use core::time::Duration;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// Undisputed alignments between two frames beyond which no further pair is tried.
+pub const ALIGNMENTS_PER_FRAME_PAIR: usize = 12;
+/// Pairs tried for one own submap against one foreign frame.
+pub const TRIES_PER_SUBMAP: usize = 12;
+/// Index distance from which two submaps of one frame may close a loop.
+pub const LOOP_GAP: u32 = 5;
+/// Decoded keypoint blobs kept in memory.
+pub const KEYPOINTS_MAX: usize = 512;
+/// Own submaps whose features are kept in memory; older ones can no longer be aligned.
+pub const FEATURES_MAX: usize = 2_000;
+/// Foreign alignments waiting to be verified.
+pub const VERIFICATIONS_MAX: usize = 1_024;
+/// Pairs remembered as tried.
+pub const TRIED_MAX: usize = 1_000_000;
+/// Blobs fetched at once.
+pub const FETCHES_MAX: usize = 4;
+/// Longest pause between two attempts to fetch one blob.
+pub const FETCH_BACKOFF_MAX: Duration = Duration::from_secs(30);
+
+/// A pair worth trying.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Candidate {
+    /// Our submap.
+    pub mine: SubmapId,
+    /// The other one (a peer's, or ours for a loop).
+    pub theirs: SubmapId,
+    /// Similarity of the summaries, 0 to 1.
+    pub similarity: f64,
+    /// The other endpoint asked for it.
+    pub wished: bool,
+}
+
+/// What a running alignment is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// To state it.
+    Propose,
+    /// To answer somebody's alignment.
+    Verify(EntryId),
+}
+
+/// A running alignment job.
+#[derive(Clone, Copy, Debug)]
+pub struct Work {
+    /// Our submap.
+    pub mine: SubmapId,
+    /// The other one.
+    pub theirs: SubmapId,
+    /// What for.
+    pub purpose: Purpose,
+}
+
+/// A blob on its way.
+#[derive(Clone, Copy, Debug)]
+pub struct Fetch {
+    /// The robot that made it.
+    pub owner: RobotId,
+    /// The question under way, if any.
+    pub query: Option<QueryId>,
+    /// Questions that failed so far.
+    pub failures: u32,
+    /// Not asked again before.
+    pub not_before: Instant,
+}
+
+/// Everything the negotiation remembers.
+#[derive(Debug, Default)]
+pub struct Negotiation {
+    features: BTreeMap<SubmapId, Arc<Features>>,
+    keypoints: BTreeMap<Hash, Arc<Keypoints>>,
+    candidates: BTreeMap<Pair, Candidate>,
+    tried: BTreeSet<Pair>,
+    tries: BTreeMap<(SubmapId, FrameId), usize>,
+    /// Foreign alignments to answer.
+    pub verify: BTreeSet<EntryId>,
+    /// Blobs on their way.
+    pub fetches: BTreeMap<Hash, Fetch>,
+    /// Jobs under way.
+    pub running: BTreeMap<JobId, Work>,
+    /// Something changed that may make work startable.
+    stirred: bool,
+    /// Pairs we are not responsible for and would like to see tried, with their similarity.
+    pub wishes: BTreeMap<Pair, f64>,
+}
+
+impl Negotiation {
+    /// Which of the two robots begins with this pair. Both compute the same answer.
+    pub fn responsible(pair: Pair) -> RobotId {
+        let mut bytes = Vec::with_capacity(32);
+        for id in [pair.0, pair.1] {
+            bytes.extend_from_slice(&id.frame.robot.0);
+            bytes.extend_from_slice(&id.frame.epoch.to_le_bytes());
+            bytes.extend_from_slice(&id.index.to_le_bytes());
+        }
+        let even = Hash::of(&bytes).0[0].is_multiple_of(2);
+        if even { pair.0.frame.robot } else { pair.1.frame.robot }
+    }
+
+    /// Something changed: look for work again.
+    pub fn stir(&mut self) {
+        self.stirred = true;
+    }
+
+    /// Whether anything changed since the last call.
+    pub fn take_stirred(&mut self) -> bool {
+        core::mem::take(&mut self.stirred)
+    }
+
+    /// Keeps the features of an own submap; the oldest beyond [`FEATURES_MAX`] go.
+    pub fn add_features(&mut self, submap: SubmapId, features: Arc<Features>) {
+        self.stirred = true;
+        self.features.insert(submap, features);
+        while self.features.len() > FEATURES_MAX {
+            self.features.pop_first();
+        }
+    }
+
+    /// The features of an own submap.
+    pub fn features(&self, submap: SubmapId) -> Option<&Arc<Features>> {
+        self.features.get(&submap)
+    }
+
+    /// Own submaps that can be aligned.
+    pub fn own(&self) -> impl Iterator<Item = SubmapId> + '_ {
+        self.features.keys().copied()
+    }
+
+    /// Keeps a decoded blob; a full cache drops one that no fetch waits for.
+    pub fn add_keypoints(&mut self, hash: Hash, keypoints: Arc<Keypoints>) {
+        if self.keypoints.len() >= KEYPOINTS_MAX {
+            self.keypoints.pop_first();
+        }
+        self.stirred = true;
+        self.keypoints.insert(hash, keypoints);
+    }
+
+    /// A decoded blob.
+    pub fn keypoints(&self, hash: Hash) -> Option<&Arc<Keypoints>> {
+        self.keypoints.get(&hash)
+    }
+
+    /// Notes a pair that may overlap; the least similar beyond `limit` goes.
+    pub fn add_candidate(&mut self, candidate: Candidate, limit: usize) {
+        let pair = pair_of(candidate.mine, candidate.theirs);
+        if self.tried.contains(&pair) || self.candidates.contains_key(&pair) {
+            return;
+        }
+        self.candidates.insert(pair, candidate);
+        if self.candidates.len() > limit {
+            let worst = self
+                .candidates
+                .iter()
+                .min_by(|a, b| a.1.similarity.total_cmp(&b.1.similarity).then(a.0.cmp(b.0)))
+                .map(|(pair, _)| *pair);
+            worst.map(|pair| self.candidates.remove(&pair));
+        }
+    }
+
+    /// The other endpoint wishes this pair tried. False if it is unknown here.
+    pub fn wish(&mut self, pair: Pair) -> bool {
+        match self.candidates.get_mut(&pair) {
+            Some(candidate) => {
+                candidate.wished = true;
+                true
+            }
+            None => false,
+        }
+    }
+
+    /// Whether a pair has been tried.
+    pub fn is_tried(&self, pair: Pair) -> bool {
+        self.tried.contains(&pair)
+    }
+
+    /// Takes a pair off the list for good.
+    pub fn mark_tried(&mut self, pair: Pair) {
+        if let Some(candidate) = self.candidates.remove(&pair) {
+            *self.tries.entry((candidate.mine, candidate.theirs.frame)).or_default() += 1;
+        }
+        if self.tried.len() < TRIED_MAX {
+            self.tried.insert(pair);
+        }
+    }
+
+    /// Candidates with an expected gain, best first. `gain` answers `None` for a pair that is dormant now.
+    pub fn ranked(&self, gain: impl Fn(&Candidate) -> Option<f64>) -> Vec<Candidate> {
+        let mut ranked: Vec<(f64, Pair, Candidate)> = self
+            .candidates
+            .iter()
+            .filter(|(_, c)| self.tries.get(&(c.mine, c.theirs.frame)).is_none_or(|&n| n < TRIES_PER_SUBMAP))
+            .filter_map(|(pair, c)| gain(c).map(|g| (g, *pair, *c)))
+            .collect();
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        ranked.into_iter().map(|(_, _, candidate)| candidate).collect()
+    }
+
+    /// Forgets all candidates (the set of facts was rebuilt).
+    pub fn clear_candidates(&mut self) {
+        self.candidates.clear();
+        self.wishes.clear();
+        self.verify.clear();
+    }
+
+    /// Notes the outcome of a fetch attempt that failed at `now`.
+    pub fn fetch_failed(&mut self, query: QueryId, now: Instant) {
+        if let Some(fetch) = self.fetches.values_mut().find(|fetch| fetch.query == Some(query)) {
+            fetch.query = None;
+            fetch.failures = fetch.failures.saturating_add(1);
+            let backoff = Duration::from_millis(500) * 2u32.pow(fetch.failures.min(7));
+            fetch.not_before = now.after(backoff.min(FETCH_BACKOFF_MAX));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn submap(robot: u8, index: u32) -> SubmapId {
+        SubmapId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 1 }, index }
+    }
+
+    fn candidate(index: u32, similarity: f64) -> Candidate {
+        Candidate { mine: submap(1, 0), theirs: submap(2, index), similarity, wished: false }
+    }
+
+    #[test]
+    fn exactly_one_endpoint_is_responsible_and_the_load_is_shared() {
+        let mut first = 0;
+        for n in 0..1000 {
+            let pair = pair_of(submap(2, n), submap(1, n));
+            let who = Negotiation::responsible(pair);
+            assert!(who == pair.0.frame.robot || who == pair.1.frame.robot);
+            assert_eq!(pair, pair_of(submap(1, n), submap(2, n)));
+            first += usize::from(who == pair.0.frame.robot);
+        }
+        assert!((400..600).contains(&first), "{first}");
+    }
+
+    #[test]
+    fn the_candidate_list_keeps_the_most_similar_up_to_its_limit() {
+        let mut n = Negotiation::default();
+        for k in 0..10 {
+            n.add_candidate(candidate(k, f64::from(k)), 5);
+        }
+        let kept: Vec<u32> = n.ranked(|c| Some(c.similarity)).iter().map(|c| c.theirs.index).collect();
+        assert_eq!(kept, [9, 8, 7, 6, 5]);
+    }
+
+    #[test]
+    fn a_tried_pair_never_returns_and_tries_are_bounded_per_frame() {
+        let mut n = Negotiation::default();
+        for k in 0..2 * TRIES_PER_SUBMAP as u32 {
+            n.add_candidate(candidate(k, 1.0), 1000);
+        }
+        let mut tried = 0;
+        while let Some(best) = n.ranked(|_| Some(1.0)).first().copied() {
+            n.mark_tried(pair_of(best.mine, best.theirs));
+            n.add_candidate(best, 1000);
+            tried += 1;
+        }
+        assert_eq!(tried, TRIES_PER_SUBMAP);
+    }
+
+    #[test]
+    fn a_failing_fetch_backs_off_up_to_the_bound() {
+        let mut n = Negotiation::default();
+        let (hash, query) = (Hash::of(b"x"), QueryId(7));
+        n.fetches
+            .insert(hash, Fetch { owner: RobotId([2; 8]), query: Some(query), failures: 0, not_before: Instant::ZERO });
+        let mut last = Duration::ZERO;
+        for _ in 0..20 {
+            n.fetches.get_mut(&hash).unwrap().query = Some(query);
+            n.fetch_failed(query, Instant::ZERO);
+            let pause = n.fetches[&hash].not_before.since(Instant::ZERO);
+            assert!(pause >= last && pause <= FETCH_BACKOFF_MAX);
+            last = pause;
+        }
+        assert_eq!(last, FETCH_BACKOFF_MAX);
+    }
+}

@@ -1,0 +1,103 @@
+//! Counters, and refusals reported without letting a noisy peer flood the log: every refusal is counted, but a peer is
+//! named in an event at most once per [`REPORT_EVERY`].
+
+use crate::ids::RobotId;
+use crate::time::Instant;
+use core::time::Duration;
+use std::collections::BTreeMap;
+
+/// Shortest time between two reports about one peer.
+pub const REPORT_EVERY: Duration = Duration::from_secs(10);
+/// Peers told apart in the counters; the rest count as one unknown peer. Bounds memory against invented names.
+pub const PEERS_MAX: usize = 1024;
+
+/// Counters since start.
+#[derive(Clone, Debug, Default)]
+pub struct Stats {
+    /// Payload bytes and messages sent, by kind.
+    pub sent: BTreeMap<&'static str, (u64, u64)>,
+    /// Payload bytes and messages received, by kind.
+    pub received: BTreeMap<&'static str, (u64, u64)>,
+    /// Refusals by reason.
+    pub rejected: BTreeMap<&'static str, u64>,
+    /// Refusals by peer.
+    pub rejected_by_peer: BTreeMap<Option<RobotId>, PeerRejections>,
+    /// Work done, by kind.
+    pub work: BTreeMap<&'static str, u64>,
+}
+
+/// Refusals of one peer's input.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct PeerRejections {
+    /// All of them.
+    pub total: u64,
+    suppressed: u64,
+    reported_at: Option<Instant>,
+}
+
+impl Stats {
+    /// Counts a message sent.
+    pub fn sent(&mut self, kind: &'static str, bytes: usize) {
+        count_message(&mut self.sent, kind, bytes);
+    }
+
+    /// Counts a message received.
+    pub fn received(&mut self, kind: &'static str, bytes: usize) {
+        count_message(&mut self.received, kind, bytes);
+    }
+
+    /// Counts a piece of work.
+    pub fn worked(&mut self, kind: &'static str) {
+        *self.work.entry(kind).or_default() += 1;
+    }
+
+    /// Counts a refusal. `Some(suppressed)` if it should be reported now, with the number of refusals of this peer
+    /// that were counted silently since the last report.
+    pub fn rejected(&mut self, now: Instant, peer: Option<RobotId>, reason: &'static str) -> Option<u64> {
+        *self.rejected.entry(reason).or_default() += 1;
+        let known = self.rejected_by_peer.contains_key(&peer) || self.rejected_by_peer.len() < PEERS_MAX;
+        let row = self.rejected_by_peer.entry(if known { peer } else { None }).or_default();
+        row.total += 1;
+        if row.reported_at.is_some_and(|at| now.since(at) < REPORT_EVERY) {
+            row.suppressed += 1;
+            return None;
+        }
+        row.reported_at = Some(now);
+        Some(core::mem::take(&mut row.suppressed))
+    }
+}
+
+fn count_message(table: &mut BTreeMap<&'static str, (u64, u64)>, kind: &'static str, bytes: usize) {
+    let row = table.entry(kind).or_default();
+    row.0 += bytes as u64;
+    row.1 += 1;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_noisy_peer_is_reported_once_per_interval_and_fully_counted() {
+        let mut stats = Stats::default();
+        let peer = Some(RobotId([1; 8]));
+        let t = |secs| Instant::ZERO.after(Duration::from_secs(secs));
+        assert_eq!(stats.rejected(t(0), peer, "bad"), Some(0));
+        for _ in 0..99 {
+            assert_eq!(stats.rejected(t(5), peer, "bad"), None);
+        }
+        assert_eq!(stats.rejected(t(10), peer, "bad"), Some(99));
+        assert_eq!(stats.rejected_by_peer[&peer].total, 101);
+        assert_eq!(stats.rejected["bad"], 101);
+    }
+
+    #[test]
+    fn invented_peers_do_not_grow_memory() {
+        let mut stats = Stats::default();
+        for n in 0..10_000u64 {
+            let _ = stats.rejected(Instant::ZERO, Some(RobotId(n.to_le_bytes())), "unknown robot");
+        }
+        assert!(stats.rejected_by_peer.len() <= PEERS_MAX + 1);
+        assert_eq!(stats.rejected["unknown robot"], 10_000);
+    }
+}

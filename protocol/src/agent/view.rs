@@ -1,0 +1,253 @@
+//! The debug view of an agent: what it believes, with the names people gave, in plain numbers (see
+//! [`crate::snapshot`]).
+
+use super::Agent;
+use super::knowledge::Agreement;
+use crate::estimate::EdgeKind;
+use crate::geometry::{PoseWithCovariance, Relative, Se3};
+use crate::ids::{FrameId, RobotId, SubmapId};
+use crate::snapshot::{
+    EdgeView, FrameView, FramesView, GraphView, MapView, PairView, PoseView, PosesView, RelationView, RobotView,
+    Snapshot, StatsView, StatusView, SubmapView,
+};
+use crate::time::Instant;
+use std::collections::{BTreeMap, BTreeSet};
+
+impl Agent {
+    /// Everything this agent believes at `now`.
+    pub fn snapshot(&self, now: Instant) -> Snapshot {
+        Snapshot {
+            status: self.status(),
+            frames: self.frames_view(),
+            poses: self.poses_view(now),
+            map: self.map_view(),
+            graph: self.graph_view(),
+            stats: self.stats_view(),
+        }
+    }
+
+    /// `view/status` alone: cheap enough to ask often.
+    pub fn status(&self) -> StatusView {
+        let pending = self.pending();
+        let settled = !self.map.dirty && self.map.solving.is_none() && self.map.digest == self.replica.digest();
+        StatusView {
+            swarm: self.me.swarm.to_string(),
+            robot: self.me.name.to_string(),
+            id: self.me.robot.to_string(),
+            epoch: self.me.frame.epoch,
+            neighbours: self.gossip.neighbours.iter().map(|robot| self.robot_name(*robot)).collect(),
+            entries: self.replica.count(),
+            digest: self.replica.digest().to_string(),
+            submaps: self.negotiation.own().count() as u64,
+            keyframes: self.mapper.keyframes,
+            pending,
+            idle: pending == 0 && settled,
+            merged_with: self.merged_with(),
+            receive_only: self.receive_only,
+        }
+    }
+
+    /// Work that this robot still has to do with the facts it holds.
+    fn pending(&self) -> u64 {
+        let writing = self.ledger.waiting.len() + self.ledger.open.len();
+        let aligning = self.negotiation.running.len() + self.negotiation.verify.len() + self.active_candidates().len();
+        (writing + aligning + self.mapper.pending()) as u64
+    }
+
+    fn merged_with(&self) -> Vec<String> {
+        let Some(estimate) = &self.map.estimate else { return Vec::new() };
+        let robots: BTreeSet<RobotId> = self.frames_merged_with_ours(estimate).iter().map(|f| f.robot).collect();
+        let mut names: Vec<String> =
+            robots.into_iter().filter(|r| *r != self.me.robot).map(|r| self.robot_name(r)).collect();
+        names.sort();
+        names
+    }
+
+    fn frames_view(&self) -> FramesView {
+        let mut submaps: BTreeMap<FrameId, u64> = BTreeMap::new();
+        for (id, _) in self.knowledge.submaps() {
+            *submaps.entry(id.frame).or_default() += 1;
+        }
+        let estimate = self.map.estimate.as_ref();
+        let frames = submaps
+            .into_iter()
+            .map(|(frame, submaps)| FrameView {
+                frame: self.frame_name(frame),
+                robot: self.robot_name(frame.robot),
+                submaps,
+                component: estimate.and_then(|e| e.component_of(frame)).unwrap_or(usize::MAX) as u64,
+                t_own_frame: self.t_own_frame(frame).as_ref().map(RelationView::from),
+            })
+            .collect();
+        FramesView { own: self.frame_name(self.me.frame), frames, pairs: self.pair_views() }
+    }
+
+    fn t_own_frame(&self, frame: FrameId) -> Option<Relative> {
+        self.map.estimate.as_ref()?.frame(self.me.frame, frame)
+    }
+
+    fn pair_views(&self) -> Vec<PairView> {
+        let Some(estimate) = &self.map.estimate else { return Vec::new() };
+        let mut proposed: BTreeMap<(FrameId, FrameId), u64> = BTreeMap::new();
+        for (_, fact) in self.knowledge.alignments() {
+            *proposed.entry((fact.i.frame, fact.j.frame)).or_default() += 1;
+        }
+        let pairs = estimate.pairs().iter();
+        pairs
+            .map(|pair| {
+                let joint = estimate.frame(pair.a, pair.b);
+                PairView {
+                    a: self.frame_name(pair.a),
+                    b: self.frame_name(pair.b),
+                    status: pair.status,
+                    proposed: proposed.get(&(pair.a, pair.b)).copied().unwrap_or(0),
+                    agreed: pair.agreed as u64,
+                    used: pair.used as u64,
+                    log10_nfa: pair.log10_nfa,
+                    t_a_b: joint.as_ref().or(pair.t_a_b.as_ref()).map(RelationView::from),
+                }
+            })
+            .collect()
+    }
+
+    fn poses_view(&self, now: Instant) -> PosesView {
+        let own = self.mapper.body().map(|(index, t_anchor_body, stamp)| {
+            let anchor = SubmapId { frame: self.me.frame, index };
+            self.robot_view(self.me.robot, anchor, &t_anchor_body, 0.0, stamp.as_secs_f64())
+        });
+        let others = self.gossip.beacons().map(|(robot, seen)| {
+            let age = now.since(seen.at).as_secs_f64();
+            let seen = &seen.content;
+            self.robot_view(robot, seen.anchor, &seen.t_anchor_body, age, seen.stamp.as_secs_f64())
+        });
+        PosesView { robots: own.into_iter().chain(others).collect() }
+    }
+
+    /// Live pose = estimate ∘ beacon.
+    fn robot_view(
+        &self,
+        robot: RobotId,
+        anchor: SubmapId,
+        t_anchor_body: &PoseWithCovariance,
+        age_secs: f64,
+        stamp_secs: f64,
+    ) -> RobotView {
+        let t_own_anchor = self.map.anchors.get(&anchor);
+        let t_own_body = t_own_anchor.map(|t| t.compose(&Relative::Metric(*t_anchor_body)));
+        RobotView {
+            robot: self.robot_name(robot),
+            age_secs,
+            stamp_secs,
+            anchor: self.submap_name(anchor),
+            t_own_body: t_own_body.as_ref().map(RelationView::from),
+        }
+    }
+
+    fn map_view(&self) -> MapView {
+        let mut submaps = Vec::new();
+        let mut t_frame_anchor = Se3::identity();
+        let mut frame = None;
+        for (id, fact) in self.knowledge.submaps() {
+            if frame.replace(id.frame) != Some(id.frame) {
+                t_frame_anchor = Se3::identity();
+            }
+            t_frame_anchor = t_frame_anchor * fact.odometry.pose;
+            submaps.push(SubmapView {
+                frame: self.frame_name(id.frame),
+                robot: self.robot_name(id.frame.robot),
+                index: id.index,
+                stamps_secs: fact.stamps.map(crate::time::Stamp::as_secs_f64),
+                t_frame_anchor: PoseView::from(&t_frame_anchor),
+                t_own_anchor: self.map.anchors.get(&id).map(RelationView::from),
+            });
+        }
+        MapView { submaps }
+    }
+
+    fn graph_view(&self) -> GraphView {
+        let Some(estimate) = &self.map.estimate else {
+            return GraphView { nodes: 0, chi2: 0.0, dof: 0, edges: self.unused_edges(&BTreeSet::new()) };
+        };
+        let mut edges = Vec::new();
+        let mut listed = BTreeSet::new();
+        for edge in estimate.edges() {
+            let measurement = &edge.measurement;
+            listed.insert(measurement.entry);
+            edges.push(EdgeView {
+                kind: match edge.kind {
+                    EdgeKind::Alignment => "alignment",
+                    EdgeKind::Sighting => "sighting",
+                }
+                .to_string(),
+                i: self.submap_name(measurement.i),
+                j: self.submap_name(measurement.j),
+                t_i_j: RelationView::from(&measurement.t_i_j),
+                agreed: true,
+                weight: edge.weight,
+                reason: edge.unused.as_ref().map(ToString::to_string).unwrap_or_default(),
+            });
+        }
+        edges.extend(self.unused_edges(&listed));
+        GraphView { nodes: estimate.nodes as u64, chi2: estimate.chi2, dof: estimate.dof as u64, edges }
+    }
+
+    /// Alignments that did not enter the estimate, with the reason.
+    fn unused_edges(&self, listed: &BTreeSet<crate::ids::EntryId>) -> Vec<EdgeView> {
+        let unused = self.knowledge.alignments().filter(|(id, _)| !listed.contains(id));
+        unused
+            .map(|(id, fact)| {
+                let agreement = self.knowledge.agreement(id);
+                EdgeView {
+                    kind: "alignment".to_string(),
+                    i: self.submap_name(fact.i),
+                    j: self.submap_name(fact.j),
+                    t_i_j: RelationView::from(&fact.t_i_j),
+                    agreed: agreement == Agreement::Agreed,
+                    weight: 0.0,
+                    reason: match agreement {
+                        Agreement::Waiting => "the other endpoint has not answered",
+                        Agreement::Disputed => "the other endpoint does not agree",
+                        Agreement::Agreed => "new, or another alignment of the pair is used",
+                    }
+                    .to_string(),
+                }
+            })
+            .collect()
+    }
+
+    fn stats_view(&self) -> StatsView {
+        let stats = &self.stats;
+        let bytes = |table: &BTreeMap<&'static str, (u64, u64)>| {
+            table.iter().map(|(kind, (bytes, _))| ((*kind).to_string(), *bytes)).collect()
+        };
+        let messages = |table: &BTreeMap<&'static str, (u64, u64)>| {
+            table.iter().map(|(kind, (_, messages))| ((*kind).to_string(), *messages)).collect()
+        };
+        let counts = |table: &BTreeMap<&'static str, u64>| {
+            table.iter().map(|(kind, count)| ((*kind).to_string(), *count)).collect()
+        };
+        let peer_name = |peer: &Option<RobotId>| peer.map_or_else(|| "unknown".to_string(), |p| self.robot_name(p));
+        StatsView {
+            sent_bytes: bytes(&stats.sent),
+            sent_messages: messages(&stats.sent),
+            received_bytes: bytes(&stats.received),
+            received_messages: messages(&stats.received),
+            rejected: counts(&stats.rejected),
+            rejected_by_peer: stats.rejected_by_peer.iter().map(|(peer, row)| (peer_name(peer), row.total)).collect(),
+            work: counts(&stats.work),
+        }
+    }
+
+    /// A robot's name, or its id if the roster does not hold it.
+    fn robot_name(&self, robot: RobotId) -> String {
+        self.replica.name_of(robot).map_or_else(|| robot.to_string(), ToString::to_string)
+    }
+
+    fn frame_name(&self, frame: FrameId) -> String {
+        format!("{}/{}", self.robot_name(frame.robot), frame.epoch)
+    }
+
+    fn submap_name(&self, id: SubmapId) -> String {
+        format!("{}#{}", self.frame_name(id.frame), id.index)
+    }
+}

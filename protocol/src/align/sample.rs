@@ -1,0 +1,356 @@
+//! Hypotheses from triangles of matches whose edge lengths agree.
+//!
+//! A rigid motion keeps lengths, so true matches are mutually compatible: they form a dense part of the compatibility
+//! graph, kept as bitsets. Edges are ranked by their common neighbours, triangles by theirs, so that even ten true among a
+//! thousand matches are among the first hypotheses. For SIM(3) the graph is built per narrow range of scale. Each
+//! hypothesis is scored by the MAGSAC++ loss in closed form (n = 3: 1 − e^{−x} − c x), improved by two reweighted solves,
+//! and triangles that a kept hypothesis explains are skipped: the candidates are distinct.
+
+use super::prepare::Matches;
+use super::refine::Context;
+use super::solve::{self, Motion};
+use libm::exp;
+use nalgebra::Vector3;
+
+/// Edges whose common neighbours are counted, at most; beyond, an even selection.
+const EDGES_MAX: usize = 65_536;
+/// Edges expanded to triangles.
+const EDGES_EXPANDED: usize = 256;
+/// Triangles kept per expanded edge.
+const TRIANGLES_PER_EDGE: usize = 3;
+/// Candidates kept.
+pub(super) const CANDIDATES_MAX: usize = 6;
+/// Half the squared 99 % quantile of χ₃.
+const EXPONENT_GATE: f64 = 0.5 * 3.368_2 * 3.368_2;
+/// Edge lengths may differ by this many √2 σ.
+const LENGTH_GATE: f64 = 2.0;
+/// A triangle's height over its longest edge, in σ, from which its motion is worth something.
+const HEIGHT_MIN: f64 = 3.0;
+
+/// One search step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Step {
+    /// Noise scale assumed, target units.
+    pub sigma: f64,
+    /// Scales sought.
+    pub scale: (f64, f64),
+    /// Hypotheses scored at most.
+    pub hypotheses_max: usize,
+}
+
+/// A motion worth a full evaluation.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Candidate {
+    pub motion: Motion,
+    pub score: f64,
+}
+
+/// Buffers reused over steps.
+#[derive(Debug, Default)]
+pub(super) struct Sampler {
+    graph: Graph,
+    edges: Vec<Edge>,
+    triangles: Vec<Triangle>,
+    common: Vec<u64>,
+    source: Vec<Vector3<f64>>,
+    target: Vec<Vector3<f64>>,
+    weights: Vec<f64>,
+    explained: Vec<Vec<u64>>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Edge {
+    common: core::cmp::Reverse<u32>,
+    i: u32,
+    j: u32,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Triangle {
+    common: core::cmp::Reverse<u32>,
+    vertices: [u32; 3],
+}
+
+impl Sampler {
+    /// The best distinct motions of the matches in `pool`, best first.
+    pub fn propose(&mut self, context: &Context, pool: &[u32], step: &Step, out: &mut Vec<Candidate>) {
+        out.clear();
+        self.source.clear();
+        self.source.extend(pool.iter().map(|&i| context.matches.source[i as usize]));
+        self.target.clear();
+        self.target.extend(pool.iter().map(|&i| context.matches.target[i as usize]));
+        self.graph.build(context.matches, pool, step);
+        self.rank_edges();
+        self.rank_triangles();
+        self.try_triangles(context, step, true, out);
+        if out.is_empty() {
+            self.try_triangles(context, step, false, out);
+        }
+        out.sort_by(|a, b| b.score.total_cmp(&a.score));
+    }
+
+    fn rank_edges(&mut self) {
+        let graph = &self.graph;
+        let degree_sum: usize = graph.rows.iter().map(|w| w.count_ones() as usize).sum();
+        let stride = (degree_sum / 2).div_ceil(EDGES_MAX).max(1);
+        self.edges.clear();
+        let mut skip = 0;
+        for i in 0..graph.count {
+            let row = graph.row(i);
+            for j in ones(row, i + 1) {
+                skip += 1;
+                if skip < stride {
+                    continue;
+                }
+                skip = 0;
+                let common = row.iter().zip(graph.row(j)).map(|(a, b)| (a & b).count_ones()).sum();
+                if common > 0 {
+                    self.edges.push(Edge { common: core::cmp::Reverse(common), i: i as u32, j: j as u32 });
+                }
+            }
+        }
+        if self.edges.len() > EDGES_EXPANDED {
+            self.edges.select_nth_unstable(EDGES_EXPANDED);
+            self.edges.truncate(EDGES_EXPANDED);
+        }
+    }
+
+    fn rank_triangles(&mut self) {
+        let graph = &self.graph;
+        self.triangles.clear();
+        for edge in &self.edges {
+            let (i, j) = (edge.i as usize, edge.j as usize);
+            self.common.clear();
+            self.common.extend(graph.row(i).iter().zip(graph.row(j)).map(|(a, b)| a & b));
+            let first = self.triangles.len();
+            for k in ones(&self.common, 0) {
+                let common: u32 = self.common.iter().zip(graph.row(k)).map(|(a, b)| (a & b).count_ones()).sum();
+                let mut vertices = [edge.i, edge.j, k as u32];
+                vertices.sort_unstable();
+                let triangle = Triangle { common: core::cmp::Reverse(common), vertices };
+                if self.triangles.len() - first < TRIANGLES_PER_EDGE {
+                    self.triangles.push(triangle);
+                } else if let Some(worst) = self.triangles[first..].iter_mut().max()
+                    && triangle < *worst
+                {
+                    *worst = triangle;
+                }
+            }
+        }
+        self.triangles.sort_unstable();
+        self.triangles.dedup();
+    }
+
+    fn try_triangles(&mut self, context: &Context, step: &Step, fat: bool, out: &mut Vec<Candidate>) {
+        self.explained.clear();
+        let mut tried = 0;
+        for t in 0..self.triangles.len() {
+            if tried >= step.hypotheses_max {
+                break;
+            }
+            let v = self.triangles[t].vertices.map(|k| k as usize);
+            if self.explained.iter().any(|set| v.iter().all(|&k| set[k / 64] >> (k % 64) & 1 == 1)) {
+                continue;
+            }
+            let Some(motion) = self.minimal(context, step, v, fat) else { continue };
+            tried += 1;
+            let score = self.score(&motion, step.sigma);
+            let worst =
+                if out.len() < CANDIDATES_MAX { 0.0 } else { out.iter().map(|c| c.score).fold(f64::MAX, f64::min) };
+            if score < 0.5 * worst {
+                continue;
+            }
+            let (motion, score) = self.improve(context, step, motion, score);
+            if score > worst {
+                self.keep(Candidate { motion, score }, step.sigma, out);
+            }
+        }
+    }
+
+    /// The motion of one triangle, if its shape determines one within the scale range.
+    fn minimal(&self, context: &Context, step: &Step, v: [usize; 3], fat: bool) -> Option<Motion> {
+        let (p, q) = (v.map(|k| &self.source[k]), v.map(|k| &self.target[k]));
+        let thin = height(q) < HEIGHT_MIN * step.sigma;
+        if thin == fat {
+            return None;
+        }
+        let motion = if fat {
+            solve::triangle(p, q, context.with_scale)?
+        } else {
+            solve::weighted(&p.map(|x| *x), &q.map(|x| *x), &[1.0; 3], context.with_scale)?
+        };
+        let (low, high) = context.scale_range;
+        let gate = 3.0 * step.sigma;
+        let fits = (0..3).all(|k| (q[k] - motion.apply(p[k])).norm_squared() <= gate * gate);
+        (fits && (low..=high).contains(&motion.scale)).then_some(motion)
+    }
+
+    /// MAGSAC++ gain of the pool at this σ: 1 for a perfect match, 0 beyond the 99 % quantile.
+    fn score(&self, motion: &Motion, sigma: f64) -> f64 {
+        let a = motion.rotation * motion.scale;
+        let unit = motion.residual_unit();
+        let inverse = 0.5 / (sigma * sigma * unit * unit);
+        let edge = exp(-EXPONENT_GATE);
+        let full = 1.0 - edge - edge * EXPONENT_GATE;
+        let mut score = 0.0;
+        for (p, q) in self.source.iter().zip(&self.target) {
+            let x = (q - (a * p + motion.translation)).norm_squared() * inverse;
+            if x < EXPONENT_GATE {
+                score += full - (1.0 - exp(-x) - edge * x);
+            }
+        }
+        score
+    }
+
+    /// Two reweighted solves over the pool; kept while the score grows.
+    fn improve(&mut self, context: &Context, step: &Step, motion: Motion, score: f64) -> (Motion, f64) {
+        let mut best = (motion, score);
+        for _ in 0..2 {
+            let motion = best.0;
+            let a = motion.rotation * motion.scale;
+            let unit = motion.residual_unit();
+            let inverse = 0.5 / (step.sigma * step.sigma * unit * unit);
+            self.weights.clear();
+            self.weights.extend(self.source.iter().zip(&self.target).map(|(p, q)| {
+                let x = (q - (a * p + motion.translation)).norm_squared() * inverse;
+                if x < EXPONENT_GATE { exp(-x) } else { 0.0 }
+            }));
+            let Some(motion) = solve::weighted(&self.source, &self.target, &self.weights, context.with_scale) else {
+                break;
+            };
+            if !(context.scale_range.0..=context.scale_range.1).contains(&motion.scale) {
+                break;
+            }
+            let score = self.score(&motion, step.sigma);
+            if score <= best.1 {
+                break;
+            }
+            best = (motion, score);
+        }
+        best
+    }
+
+    /// Keeps a candidate, in place of the worst if full, and what it explains.
+    fn keep(&mut self, candidate: Candidate, sigma: f64, out: &mut Vec<Candidate>) {
+        let gate = 3.0 * sigma * candidate.motion.residual_unit();
+        let mut set = vec![0_u64; self.graph.words];
+        for (k, (p, q)) in self.source.iter().zip(&self.target).enumerate() {
+            if (q - candidate.motion.apply(p)).norm_squared() < gate * gate {
+                set[k / 64] |= 1 << (k % 64);
+            }
+        }
+        if out.len() < CANDIDATES_MAX {
+            out.push(candidate);
+            self.explained.push(set);
+        } else {
+            let worst = (1..out.len()).fold(0, |w, k| if out[k].score < out[w].score { k } else { w });
+            out[worst] = candidate;
+            self.explained[worst] = set;
+        }
+    }
+}
+
+/// Height of a triangle over its longest edge.
+fn height(q: [&Vector3<f64>; 3]) -> f64 {
+    let area2 = (q[1] - q[0]).cross(&(q[2] - q[0])).norm();
+    let longest = (q[1] - q[0]).norm().max((q[2] - q[0]).norm()).max((q[2] - q[1]).norm());
+    if longest > 0.0 { area2 / longest } else { 0.0 }
+}
+
+/// Positions of set bits from `from` on.
+fn ones(words: &[u64], from: usize) -> impl Iterator<Item = usize> {
+    let first = from / 64;
+    words.iter().enumerate().skip(first).flat_map(move |(w, &bits)| {
+        let mut bits = if w == first { bits & (u64::MAX << (from % 64)) } else { bits };
+        core::iter::from_fn(move || {
+            let k = bits.trailing_zeros() as usize;
+            bits &= bits.wrapping_sub(1);
+            (k < 64).then_some(w * 64 + k)
+        })
+    })
+}
+
+/// Which matches agree in length, pair by pair.
+#[derive(Debug, Default)]
+struct Graph {
+    count: usize,
+    /// Words a row.
+    words: usize,
+    rows: Vec<u64>,
+    /// Coordinates by axis in units of σ's scene, f32, padded with NaN to whole words.
+    source: [Vec<f32>; 3],
+    target: [Vec<f32>; 3],
+}
+
+impl Graph {
+    fn row(&self, i: usize) -> &[u64] {
+        &self.rows[i * self.words..(i + 1) * self.words]
+    }
+
+    fn build(&mut self, matches: &Matches, pool: &[u32], step: &Step) {
+        self.count = pool.len();
+        self.words = pool.len().div_ceil(64);
+        let padded = self.words * 64;
+        // Units in which coordinates are near 1, so that f32 neither overflows nor loses the tolerance.
+        let unit = matches.target_extent.iter().fold(step.sigma, |m, &l| m.max(l));
+        let (low, high) = step.scale;
+        let middle = (low * high).sqrt();
+        for axis in 0..3 {
+            let fill = |column: &mut Vec<f32>, points: &[Vector3<f64>], factor: f64| {
+                column.clear();
+                column.extend(pool.iter().map(|&i| (points[i as usize][axis] * factor) as f32));
+                column.resize(padded, f32::NAN);
+            };
+            fill(&mut self.source[axis], &matches.source, middle / unit);
+            fill(&mut self.target[axis], &matches.target, 1.0 / unit);
+        }
+        let tolerance = (LENGTH_GATE * core::f64::consts::SQRT_2 * step.sigma / unit) as f32;
+        let (low, high) = ((low / middle) as f32, (high / middle) as f32);
+        self.rows.clear();
+        self.rows.resize(self.count * self.words, 0);
+        for i in 0..self.count {
+            for w in i / 64..self.words {
+                let bits = self.compatible(i, w * 64, low, high, tolerance);
+                let bits = if w == i / 64 { bits & (u64::MAX << (i % 64)) & !(1 << (i % 64)) } else { bits };
+                self.rows[i * self.words + w] |= bits;
+                let mut rest = bits;
+                while rest != 0 {
+                    let j = w * 64 + rest.trailing_zeros() as usize;
+                    self.rows[j * self.words + i / 64] |= 1 << (i % 64);
+                    rest &= rest - 1;
+                }
+            }
+        }
+    }
+
+    /// Bit k: whether match `i` and match `start + k` agree: `low·d − τ ≤ e ≤ high·d + τ` for source length d ≥ τ and
+    /// target length e.
+    fn compatible(&self, i: usize, start: usize, low: f32, high: f32, tolerance: f32) -> u64 {
+        let block = |column: &[Vec<f32>; 3]| -> [[f32; 64]; 3] {
+            core::array::from_fn(|axis| {
+                let mut block = [0.0; 64];
+                block.copy_from_slice(&column[axis][start..start + 64]);
+                block
+            })
+        };
+        let (s, t) = (block(&self.source), block(&self.target));
+        let p = [self.source[0][i], self.source[1][i], self.source[2][i]];
+        let q = [self.target[0][i], self.target[1][i], self.target[2][i]];
+        let mut flags = [0_u8; 64];
+        for k in 0..64 {
+            let (a, b, c) = (s[0][k] - p[0], s[1][k] - p[1], s[2][k] - p[2]);
+            let d = (a * a + b * b + c * c).sqrt();
+            let (a, b, c) = (t[0][k] - q[0], t[1][k] - q[1], t[2][k] - q[2]);
+            let e = (a * a + b * b + c * c).sqrt();
+            let agrees = (low * d - tolerance <= e) & (e <= high * d + tolerance) & (d >= tolerance) & (e >= tolerance);
+            flags[k] = u8::from(agrees);
+        }
+        // Eight 0/1 bytes to eight bits at a time.
+        let mut bits = 0;
+        for (k, bytes) in flags.chunks_exact(8).enumerate() {
+            let word = bytes.iter().rev().fold(0_u64, |w, &b| w << 8 | u64::from(b));
+            bits |= (word.wrapping_mul(0x0102_0408_1020_4080) >> 56) << (8 * k);
+        }
+        bits
+    }
+}

@@ -1,0 +1,150 @@
+//! How far each pair of alignments contradicts each other, and how surprising an agreement is (MATH §3, §5).
+//!
+//! Alignment m says T_αβ = T_im T_m T_jm⁻¹. Put into alignment l's residual, the absolute poses cancel to the odometry
+//! between the anchors: h = log((A T_l)⁻¹ T_m B), A = t_im_il, B = t_jm_jl. It is the residual of
+//! [`super::super::residual`] with A, T_m, B for T_i, T_αβ, T_j, and its four errors are independent.
+
+use super::clique::{self, Set, bit};
+use super::{Alignment, Candidate, Measured, gate};
+use crate::estimate::residual::Residual;
+use crate::estimate::trajectory::Trajectory;
+use crate::geometry::{Group, Se3};
+use core::f64::consts::PI;
+use libm::{lgamma, log};
+use nalgebra::{Matrix6, SMatrix};
+
+/// Distances between n alignments, row = hypothesis, column = the alignment tested under it.
+pub(super) struct Pairs {
+    n: usize,
+    /// Squared Mahalanobis distances; infinite where they are not to be had.
+    distance_squared: Vec<f64>,
+    /// ln √det of each residual's covariance.
+    log_sqrt_det: Vec<f64>,
+}
+
+impl Pairs {
+    pub(super) fn new<const N: usize, G: Group<N>>(measured: &Measured<'_, N, G>) -> Self {
+        let alignments = &measured.alignments;
+        let n = alignments.len();
+        let mut pairs = Self { n, distance_squared: vec![0.0; n * n], log_sqrt_det: vec![0.0; n * n] };
+        let (alpha, beta) = (
+            Odometry::new(measured.alpha, alignments.iter().map(|a| a.i)),
+            Odometry::new(measured.beta, alignments.iter().map(|a| a.j)),
+        );
+        for (m, hypothesis) in alignments.iter().enumerate() {
+            let (from_i, from_j) = (alpha.relatives(m), beta.relatives(m));
+            for (l, tested) in alignments.iter().enumerate().filter(|&(l, _)| l != m) {
+                let (d2, log_sqrt_det) = distance(hypothesis, tested, &from_i[alpha.slot[l]], &from_j[beta.slot[l]]);
+                pairs.distance_squared[m * n + l] = d2;
+                pairs.log_sqrt_det[m * n + l] = log_sqrt_det;
+            }
+        }
+        pairs
+    }
+
+    /// Whether m and l agree at the gate, each under the other.
+    pub(super) fn agree(&self, m: usize, l: usize, gate: f64) -> bool {
+        self.distance_squared[m * self.n + l] < gate && self.distance_squared[l * self.n + m] < gate
+    }
+
+    /// Whether two disjoint sets deny each other: fewer than half of the pairs across agree at the wider of their gates.
+    /// Two halves of one truth, parted by a pair just outside the gate, do not.
+    pub(super) fn contradict<const N: usize>(&self, a: &Candidate, b: &Candidate) -> bool {
+        let gate = gate(N, a.scale.max(b.scale));
+        let across = || clique::vertices(a.set).flat_map(|m| clique::vertices(b.set).map(move |l| (m, l)));
+        2 * across().filter(|&(m, l)| self.agree(m, l, gate)).count() < across().count()
+    }
+
+    /// Neighbours of each alignment in the graph of agreement at a gate on d².
+    pub(super) fn graph(&self, gate: f64) -> Vec<Set> {
+        let neighbours = |m: usize| (0..self.n).filter(|&l| l != m && self.agree(m, l, gate)).map(bit).sum();
+        (0..self.n).map(neighbours).collect()
+    }
+
+    /// Log₁₀ of the number of false alarms of `set` at a gate on d², and the member it is counted from.
+    ///
+    /// Under chance a residual falls evenly into `volume`; it meets a hypothesis within the gate with the probability
+    /// α of the gate's ellipsoid. NFA = n S C(n−1, k) Π α over the k other members, S the number of scales tried; the
+    /// smallest over members as hypotheses.
+    pub(super) fn log10_nfa<const N: usize>(&self, set: Set, gate: f64, volume: f64, scales: usize) -> (f64, usize) {
+        let k = f64::from(set.count_ones().saturating_sub(1));
+        let n = self.n as f64;
+        let choices = log(n * scales as f64) + lgamma(n) - lgamma(k + 1.0) - lgamma(n - k);
+        let ball = log_ball_volume(N) + 0.5 * N as f64 * log(gate) - log(volume);
+        let mut best = (f64::INFINITY, 0);
+        for hub in clique::vertices(set) {
+            let others = clique::vertices(set & !bit(hub));
+            let chance: f64 = others.map(|l| (ball + self.log_sqrt_det[hub * self.n + l]).min(0.0)).sum();
+            let nfa = (choices + chance) / core::f64::consts::LN_10;
+            if nfa < best.0 {
+                best = (nfa, hub);
+            }
+        }
+        best
+    }
+}
+
+/// d² of `tested` under `hypothesis`, and ln √det of the residual's covariance.
+fn distance<const N: usize, G: Group<N>>(
+    hypothesis: &Alignment<N, G>,
+    tested: &Alignment<N, G>,
+    (a, sigma_a): &(Se3, Matrix6<f64>),
+    (b, sigma_b): &(Se3, Matrix6<f64>),
+) -> (f64, f64) {
+    let r = Residual::new(&G::embed(a), &tested.t_i_j, &hypothesis.t_i_j, &G::embed(b));
+    let sigma: SMatrix<f64, N, N> =
+        r.covariance(&G::embed_covariance(sigma_a), &G::embed_covariance(sigma_b), tested.covariance.matrix())
+            + r.j_alpha_beta * hypothesis.covariance.matrix() * r.j_alpha_beta.transpose();
+    let Some(c) = sigma.cholesky() else { return (f64::INFINITY, 0.0) };
+    let log_sqrt_det = c.l_dirty().diagonal().iter().map(|&x| log(x)).sum();
+    let d2 = c.solve(&r.h).dot(&r.h);
+    (if d2.is_nan() { f64::INFINITY } else { d2 }, log_sqrt_det)
+}
+
+/// ln of the volume of the unit ball: π³/6 in six dimensions, 16π³/105 in seven.
+fn log_ball_volume(dimension: usize) -> f64 {
+    let half = 0.5 * dimension as f64;
+    half * log(PI) - lgamma(half + 1.0)
+}
+
+/// Odometry between the distinct anchors that alignments stand on.
+struct Odometry {
+    /// Position of each alignment's anchor among the distinct ones.
+    slot: Vec<usize>,
+    /// From each distinct anchor to the next.
+    steps: Vec<(Se3, Matrix6<f64>)>,
+}
+
+impl Odometry {
+    fn new(trajectory: &Trajectory, anchors: impl Iterator<Item = usize> + Clone) -> Self {
+        let mut distinct: Vec<usize> = anchors.clone().collect();
+        distinct.sort_unstable();
+        distinct.dedup();
+        let slot = anchors.map(|a| distinct.partition_point(|&d| d < a)).collect();
+        let steps = distinct.windows(2).filter_map(|w| trajectory.relative_exact(w[0], w[1])).collect();
+        Self { slot, steps }
+    }
+
+    /// Every distinct anchor relative to that of alignment `m`.
+    fn relatives(&self, m: usize) -> Vec<(Se3, Matrix6<f64>)> {
+        let own = self.slot[m];
+        let mut relatives = vec![(Se3::identity(), Matrix6::zeros()); self.steps.len() + 1];
+        for k in own..self.steps.len() {
+            relatives[k + 1] = compose(&relatives[k], &self.steps[k]);
+        }
+        for k in (0..own).rev() {
+            relatives[k] = compose(&relatives[k + 1], &inverse(&self.steps[k]));
+        }
+        relatives
+    }
+}
+
+fn compose((a, sigma_a): &(Se3, Matrix6<f64>), (b, sigma_b): &(Se3, Matrix6<f64>)) -> (Se3, Matrix6<f64>) {
+    let m = b.inverse().adjoint();
+    (*a * *b, m * sigma_a * m.transpose() + sigma_b)
+}
+
+fn inverse((a, sigma): &(Se3, Matrix6<f64>)) -> (Se3, Matrix6<f64>) {
+    let m = a.adjoint();
+    (a.inverse(), m * sigma * m.transpose())
+}

@@ -1,0 +1,174 @@
+//! A seeded world for tests: two robots drive the same figure-eight with drifting odometry, meet, and align; some
+//! alignments are false, some of those agree with each other (perceptual aliasing).
+
+use super::PairAlignment;
+use crate::estimate::trajectory::Trajectory;
+use crate::geometry::test_support::{normal, normals, rng, uniform};
+use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3, se3};
+use core::f64::consts::PI;
+use libm::{cos, sin};
+use nalgebra::{Matrix3, Vector3, Vector6};
+use rand::RngExt;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+
+const ANCHORS: usize = 150;
+const ODOMETRY_SIGMAS: [f64; 2] = [0.02, 0.003];
+const ALIGNMENT_SIGMAS: [f64; 2] = [0.05, 0.01];
+
+/// What is drawn.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Draw {
+    /// Alignments that are true.
+    pub(super) real: usize,
+    /// False alignments that agree with each other.
+    pub(super) aliased: usize,
+    /// False alignments at random.
+    pub(super) random: usize,
+    /// Factor by which true alignments are noisier than they claim.
+    pub(super) under_reported: f64,
+}
+
+pub(super) struct World {
+    pub(super) alpha: Trajectory,
+    pub(super) beta: Trajectory,
+    pub(super) alignments: Vec<PairAlignment>,
+    /// Whether each alignment is true.
+    pub(super) real: Vec<bool>,
+    pub(super) t_alpha_beta: Se3,
+    beta_centre: Vector3<f64>,
+}
+
+impl World {
+    pub(super) fn new(seed: u64, draw: Draw) -> Self {
+        let rng = &mut rng(seed);
+        let (start_a, start_b) = (uniform(rng, 0.0, 2.0 * PI), uniform(rng, 0.0, 2.0 * PI));
+        let at = |start: f64, k: usize| circuit(start + 2.0 * PI * k as f64 / ANCHORS as f64);
+        let true_a: Vec<Se3> = (0..ANCHORS).map(|k| at(start_a, k)).collect();
+        let true_b: Vec<Se3> = (0..ANCHORS).map(|k| at(start_b, k).retract(&scaled(rng, [0.3, 0.05]))).collect();
+        let mut near: Vec<(usize, usize)> = (0..ANCHORS)
+            .flat_map(|i| (0..ANCHORS).map(move |j| (i, j)))
+            .filter(|&(i, j)| (true_a[i].translation - true_b[j].translation).norm() < 3.0)
+            .collect();
+        near.shuffle(rng);
+        let mut found: Vec<(usize, usize, Se3, bool)> = Vec::new();
+        for &(i, j) in near.iter().take(draw.real) {
+            let noise = scaled(rng, ALIGNMENT_SIGMAS) * draw.under_reported;
+            found.push((i, j, (true_a[i].inverse() * true_b[j]).retract(&noise), true));
+        }
+        let mut shift: Vector3<f64> = normals(rng);
+        shift.z *= 0.1;
+        let displaced = Se3::new(So3::identity(), shift * (5.0 / shift.norm()));
+        for _ in 0..draw.aliased {
+            let (i, j) = near[rng.random_range(0..near.len())];
+            let t_i_j = (true_a[i].inverse() * displaced * true_b[j]).retract(&scaled(rng, ALIGNMENT_SIGMAS));
+            found.push((i, j, t_i_j, false));
+        }
+        for _ in 0..draw.random {
+            found.push((rng.random_range(0..ANCHORS), rng.random_range(0..ANCHORS), false_alignment(rng), false));
+        }
+        found.shuffle(rng);
+        let covariance = covariance(ALIGNMENT_SIGMAS);
+        let t_alpha_beta = true_a[0].inverse() * true_b[0];
+        let centre = true_b.iter().map(|t| (true_b[0].inverse() * *t).translation).sum::<Vector3<f64>>();
+        Self {
+            alpha: odometry(rng, &true_a),
+            beta: odometry(rng, &true_b),
+            real: found.iter().map(|f| f.3).collect(),
+            alignments: found
+                .into_iter()
+                .map(|(i, j, pose, _)| PairAlignment { i, j, t_i_j: PoseWithCovariance { pose, covariance } })
+                .collect(),
+            t_alpha_beta,
+            beta_centre: centre / ANCHORS as f64,
+        }
+    }
+
+    /// Whether an estimate is right: within 8° and, at the middle of β's map, 3 m of the truth.
+    pub(super) fn is_right(&self, t_alpha_beta: &Se3) -> bool {
+        let error = self.t_alpha_beta.inverse() * *t_alpha_beta;
+        let shift = (error * self.beta_centre - self.beta_centre).norm();
+        error.rotation.angle() < 8.0_f64.to_radians() && shift < 3.0
+    }
+
+    /// Normalised estimation error squared.
+    pub(super) fn nees(&self, estimate: &PoseWithCovariance) -> f64 {
+        estimate.covariance.mahalanobis_squared(&estimate.pose.local(&self.t_alpha_beta))
+    }
+}
+
+/// A [`World`] whose β is in units of its own.
+pub(super) struct SimWorld {
+    pub(super) alpha: Trajectory,
+    pub(super) beta: Trajectory,
+    pub(super) alignments: Vec<PairAlignment<SimWithCovariance>>,
+    pub(super) t_alpha_beta: Sim3,
+}
+
+impl World {
+    /// The same world, β's unit drawn between 0.2 and 5 m; true alignments measure it to 3 %, false ones tell any.
+    pub(super) fn with_unknown_scale(&self, seed: u64) -> SimWorld {
+        let rng = &mut rng(seed);
+        let unit = libm::exp(uniform(rng, -1.6, 1.6));
+        // A length in metres is 1/unit of β's; so are translations' standard deviations.
+        let mut beta = Trajectory::default();
+        let mut previous = Se3::identity();
+        for k in 0..self.beta.len() {
+            let anchor = self.beta.pose(k).unwrap();
+            let step = previous.inverse() * anchor;
+            let sigmas = if k == 0 { [1e-8, 1e-8] } else { [ODOMETRY_SIGMAS[0] / unit, ODOMETRY_SIGMAS[1]] };
+            let pose = Se3::new(step.rotation, step.translation / unit);
+            beta.push(PoseWithCovariance { pose, covariance: covariance(sigmas) });
+            previous = anchor;
+        }
+        let [m, r] = ALIGNMENT_SIGMAS;
+        let of_alignment = Covariance::from_sigmas([m / unit, m / unit, m / unit, r, r, r, 0.03]).unwrap();
+        let alignments = self.alignments.iter().zip(&self.real).map(|(a, &real)| {
+            let told = if real { 0.03 * normal(rng) } else { uniform(rng, -1.0, 1.0) };
+            let sim = Sim3::new(a.t_i_j.pose.rotation, a.t_i_j.pose.translation, unit * libm::exp(told));
+            PairAlignment { i: a.i, j: a.j, t_i_j: SimWithCovariance { sim, covariance: of_alignment } }
+        });
+        let truth = self.t_alpha_beta;
+        SimWorld {
+            alpha: self.alpha.clone(),
+            alignments: alignments.collect(),
+            beta,
+            t_alpha_beta: Sim3::new(truth.rotation, truth.translation, unit),
+        }
+    }
+}
+
+/// A point of the figure-eight, about 60 × 30 × 3 m, heading along the way.
+fn circuit(s: f64) -> Se3 {
+    let point = |s: f64| Vector3::new(30.0 * sin(s), 15.0 * sin(2.0 * s), 1.5 * sin(3.0 * s));
+    let x = (Vector3::new(30.0 * cos(s), 30.0 * cos(2.0 * s), 4.5 * cos(3.0 * s))).normalize();
+    let y = Vector3::z().cross(&x).normalize();
+    Se3::new(So3::from_matrix(&Matrix3::from_columns(&[x, y, x.cross(&y)])), point(s))
+}
+
+fn odometry(rng: &mut ChaCha8Rng, truth: &[Se3]) -> Trajectory {
+    // A frame is its first anchor, exactly.
+    let origin = PoseWithCovariance { pose: Se3::identity(), covariance: covariance([1e-8, 1e-8]) };
+    let mut trajectory = Trajectory::new([origin]);
+    for pair in truth.windows(2) {
+        let pose = (pair[0].inverse() * pair[1]).retract(&scaled(rng, ODOMETRY_SIGMAS));
+        trajectory.push(PoseWithCovariance { pose, covariance: covariance(ODOMETRY_SIGMAS) });
+    }
+    trajectory
+}
+
+/// Up to 3 m, nearly level, mostly of about the same heading.
+fn false_alignment(rng: &mut ChaCha8Rng) -> Se3 {
+    let turned = rng.random_bool(0.3);
+    let yaw = if turned { uniform(rng, -PI, PI) } else { 0.0 } + 0.1 * normal(rng);
+    let rho = Vector3::new(uniform(rng, -3.0, 3.0), uniform(rng, -3.0, 3.0), uniform(rng, -0.3, 0.3));
+    Se3::exp(&se3::join(&rho, &Vector3::new(0.05 * normal(rng), 0.05 * normal(rng), yaw)))
+}
+
+fn scaled(rng: &mut ChaCha8Rng, [metres, radians]: [f64; 2]) -> Vector6<f64> {
+    normals::<6>(rng).component_mul(&Vector6::new(metres, metres, metres, radians, radians, radians))
+}
+
+fn covariance([m, r]: [f64; 2]) -> Covariance<6> {
+    Covariance::from_sigmas([m, m, m, r, r, r]).unwrap()
+}

@@ -1,0 +1,239 @@
+//! Canonical order and admission: decides which measurements can be considered at all, before any statistics.
+//!
+//! Facts come in any order and from anyone. Here they are sorted, repeats are set aside (one measurement counts once,
+//! DESIGN §8.10), and whatever names unknown submaps or holds invalid numbers is kept with its reason.
+
+use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
+use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
+use super::trajectory::Trajectory;
+use crate::geometry::{PoseWithCovariance, Relative};
+use crate::ids::{EntryId, FrameId, SubmapId};
+use crate::snapshot::PairStatus;
+use crate::wire::fact::ScaleKind;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Rotation standard deviation from which a measurement says nothing, rad.
+pub const SIGMA_ROTATION_MAX: f64 = 3.0;
+/// Translation standard deviation from which a measurement says nothing, in units of its frame.
+pub const SIGMA_TRANSLATION_MAX: f64 = 1e4;
+/// Log-scale standard deviation from which a measurement says nothing.
+pub const SIGMA_LOG_SCALE_MAX: f64 = 3.0;
+
+/// What a measurement is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// Of two submaps' clouds.
+    Alignment,
+    /// Of another robot.
+    Sighting,
+}
+
+/// A frame's anchors by odometry alone.
+#[derive(Clone, Debug)]
+pub(super) struct Chain {
+    /// `t_frame_anchor0`.
+    pub(super) origin: PoseWithCovariance,
+    /// `t_prev_this` of the anchors from the second on.
+    pub(super) steps: Vec<PoseWithCovariance>,
+    /// The same, compounded.
+    pub(super) trajectory: Trajectory,
+}
+
+/// The admitted problem. An edge counts while its `unused` is `None`.
+pub(super) struct Intake {
+    pub(super) chains: BTreeMap<FrameId, Chain>,
+    pub(super) unknown_scale: BTreeSet<FrameId>,
+    pub(super) edges: Vec<EdgeEstimate>,
+}
+
+impl Intake {
+    pub(super) fn new(problem: &MapProblem) -> Self {
+        let chain = |(&f, c): (&FrameId, &super::joint::FrameChain)| Some((f, Chain::new(&c.odometry)?));
+        let chains: BTreeMap<_, _> = problem.frames.iter().filter_map(chain).collect();
+        let unknown = problem.frames.iter().filter(|(_, c)| c.scale == ScaleKind::Unknown);
+        let unknown_scale = unknown.map(|(&f, _)| f).collect();
+        let mut intake = Self { chains, unknown_scale, edges: Vec::new() };
+        let alignments = sorted(&problem.alignments).into_iter().map(|m| (Kind::Alignment, m));
+        let sightings = sorted(&problem.sightings).into_iter().map(|m| (Kind::Sighting, m));
+        let (mut entries, mut submaps) = (BTreeSet::new(), BTreeMap::new());
+        for (kind, measurement) in alignments.chain(sightings) {
+            let unused = intake.refusal(kind, &measurement, &mut entries, &mut submaps);
+            let weight = if unused.is_none() { 1.0 } else { 0.0 };
+            intake.edges.push(EdgeEstimate { kind, measurement, weight, unused });
+        }
+        intake
+    }
+
+    fn refusal(
+        &self,
+        kind: Kind,
+        m: &AgreedAlignment,
+        entries: &mut BTreeSet<(Kind, EntryId)>,
+        submaps: &mut BTreeMap<(SubmapId, SubmapId), EntryId>,
+    ) -> Option<Unused> {
+        let same_frame = m.i.frame == m.j.frame;
+        let known = |id: SubmapId| self.chains.get(&id.frame).is_some_and(|c| (id.index as usize) < c.len());
+        let same_unit = same_frame || ![m.i, m.j].iter().any(|id| self.unknown_scale.contains(&id.frame));
+        if !is_usable(&m.t_i_j) {
+            return Some(Unused::NotFinite);
+        }
+        if says_nothing(&m.t_i_j) {
+            return Some(Unused::TooUncertain);
+        }
+        if m.i == m.j {
+            return Some(Unused::SelfLoop);
+        }
+        if !(known(m.i) && known(m.j)) {
+            return Some(Unused::UnknownSubmap);
+        }
+        if same_unit != matches!(m.t_i_j, Relative::Metric(_)) {
+            return Some(Unused::Units);
+        }
+        if kind == Kind::Sighting && same_frame {
+            return Some(Unused::SameFrame);
+        }
+        if !entries.insert((kind, m.entry)) {
+            return Some(Unused::RepeatsEntry);
+        }
+        if kind == Kind::Alignment {
+            let key = (m.i.min(m.j), m.i.max(m.j));
+            if let Some(&first) = submaps.get(&key) {
+                return Some(Unused::RepeatsPair(first));
+            }
+            submaps.insert(key, m.entry);
+        } else {
+            // Until the alignments alone have merged its frames.
+            return Some(Unused::Unmerged(PairStatus::Provisional));
+        }
+        None
+    }
+
+    /// Sets an edge aside; whether it counted until now.
+    pub(super) fn drop_edge(&mut self, label: Label, reason: Unused) -> bool {
+        let wanted = match label {
+            Label::Odometry => return false,
+            Label::Alignment(entry) => (Kind::Alignment, entry),
+            Label::Sighting(entry) => (Kind::Sighting, entry),
+        };
+        let is_it = |e: &&mut EdgeEstimate| e.unused.is_none() && (e.kind, e.measurement.entry) == wanted;
+        self.edges.iter_mut().find(is_it).map(|e| e.refuse(reason)).is_some()
+    }
+
+    /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst; whether any
+    /// counted until now.
+    pub(super) fn isolate_worst(&mut self, frames: &BTreeSet<FrameId>, reason: Unused) -> bool {
+        let counts =
+            |e: &EdgeEstimate, f: FrameId| e.is_used() && [e.measurement.i.frame, e.measurement.j.frame].contains(&f);
+        let tied = frames.iter().filter(|&&f| self.edges.iter().any(|e| counts(e, f)));
+        let spread = |f: &FrameId| self.chains.get(f).map_or(f64::INFINITY, Chain::spread);
+        let Some(&worst) = tied.max_by(|x, y| spread(x).total_cmp(&spread(y))) else { return false };
+        let mut any = false;
+        for edge in self.edges.iter_mut().filter(|e| counts(e, worst)) {
+            edge.refuse(reason);
+            any = true;
+        }
+        any
+    }
+
+    /// Groups frames by the alignments that count: each frame with a number shared by its group.
+    pub(super) fn groups(&self) -> BTreeMap<FrameId, usize> {
+        let place: BTreeMap<FrameId, usize> = self.chains.keys().enumerate().map(|(k, &f)| (f, k)).collect();
+        let mut sets = Disjoint::new(place.len());
+        for edge in self.edges.iter().filter(|e| e.kind == Kind::Alignment && e.unused.is_none()) {
+            sets.join(place[&edge.measurement.i.frame], place[&edge.measurement.j.frame]);
+        }
+        place.into_iter().map(|(f, k)| (f, sets.root(k))).collect()
+    }
+
+    /// Sets aside sightings between frames that alignments do not merge: a sighting alone never does.
+    pub(super) fn drop_stray_sightings(&mut self) {
+        let groups = self.groups();
+        let stray = |e: &&mut EdgeEstimate| {
+            e.unused.is_none() && groups.get(&e.measurement.i.frame) != groups.get(&e.measurement.j.frame)
+        };
+        self.edges.iter_mut().filter(stray).for_each(|e| e.refuse(Unused::Unmerged(PairStatus::Provisional)));
+    }
+
+    /// Lets in the sightings that agree with the map so far; whether there are any.
+    pub(super) fn admit_sightings(&mut self, relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>) -> bool {
+        let mut any = false;
+        let waiting = |e: &&mut EdgeEstimate| {
+            e.kind == Kind::Sighting && matches!(e.unused, Some(Unused::Unmerged(PairStatus::Provisional)))
+        };
+        for edge in self.edges.iter_mut().filter(waiting) {
+            let Some(predicted) = relative(edge.measurement.i, edge.measurement.j) else { continue };
+            let distance = predicted.disagreement(&edge.measurement.t_i_j);
+            if distance.is_consistent() {
+                (edge.weight, edge.unused) = (1.0, None);
+                any = true;
+            } else {
+                edge.refuse(Unused::Contradicts(distance.distance_squared));
+            }
+        }
+        any
+    }
+}
+
+impl EdgeEstimate {
+    /// Takes the edge out of the estimate.
+    pub(super) fn refuse(&mut self, reason: Unused) {
+        (self.weight, self.unused) = (0.0, Some(reason));
+    }
+}
+
+impl Chain {
+    /// The chain up to the first step that is not a valid pose or says nothing; `None` if nothing is left.
+    fn new(odometry: &[PoseWithCovariance]) -> Option<Self> {
+        let holds = |t: &Relative| is_usable(t) && !says_nothing(t);
+        let usable = odometry.iter().take_while(|p| holds(&Relative::Metric(**p)));
+        let steps: Vec<PoseWithCovariance> = usable.copied().collect();
+        let origin = *steps.first()?;
+        let trajectory = Trajectory::new(steps.iter().copied());
+        Some(Self { origin, steps: steps[1..].to_vec(), trajectory })
+    }
+
+    /// Largest over smallest variance of its steps: how badly it conditions a component.
+    pub(super) fn spread(&self) -> f64 {
+        let variances = || self.steps.iter().flat_map(|s| s.covariance.matrix().diagonal().data.0[0]);
+        variances().fold(0.0, f64::max) / variances().fold(f64::MAX, f64::min)
+    }
+
+    /// Number of anchors.
+    pub(super) fn len(&self) -> usize {
+        self.trajectory.len()
+    }
+
+    pub(super) fn ids(&self, frame: FrameId) -> impl Iterator<Item = SubmapId> + use<> {
+        (0..self.len() as u32).map(move |index| SubmapId { frame, index })
+    }
+
+    pub(super) fn factors(&self, frame: FrameId) -> impl Iterator<Item = Factor> + '_ {
+        (1u32..).zip(&self.steps).map(move |(index, step)| Factor {
+            label: Label::Odometry,
+            i: SubmapId { frame, index: index - 1 },
+            j: SubmapId { frame, index },
+            t_i_j: Relative::Metric(*step),
+            weight: 1.0,
+        })
+    }
+}
+
+fn says_nothing(t: &Relative) -> bool {
+    let (sigmas, of_scale): ([f64; 6], f64) = match t {
+        Relative::Metric(p) => (p.covariance.sigmas().into(), 0.0),
+        Relative::Similarity(s) => {
+            let all = s.covariance.sigmas();
+            (all.fixed_rows::<6>(0).into_owned().into(), all[6])
+        }
+    };
+    let (of_translation, of_rotation) = sigmas.split_at(3);
+    of_translation.iter().any(|&s| s > SIGMA_TRANSLATION_MAX)
+        || of_rotation.iter().any(|&s| s > SIGMA_ROTATION_MAX)
+        || of_scale > SIGMA_LOG_SCALE_MAX
+}
+
+fn sorted(list: &[AgreedAlignment]) -> Vec<AgreedAlignment> {
+    let mut out = list.to_vec();
+    out.sort_by(|a, b| (a.entry, a.i, a.j).cmp(&(b.entry, b.i, b.j)).then_with(|| content_order(&a.t_i_j, &b.t_i_j)));
+    out
+}

@@ -1,0 +1,368 @@
+//! The map as a pure function of the set of facts: decides which frames merge, which measurements count, and where every
+//! anchor lies (DESIGN §7, MATH §3 and §5).
+//!
+//! 1. `intake` sorts the facts canonically and lists what cannot be used.
+//! 2. `pairs` runs the frame-level consensus on each pair of frames and accepts merges along the strongest spanning
+//!    forest; a pair that contradicts a loop of frames (χ², 99.99 %) is left out.
+//! 3. Here, the whole graph is solved with the alignments that remain; one whose leave-one-out χ² exceeds 99.9 % is
+//!    dropped, the largest first, and the graph solved again.
+//! 4. Sightings between merged frames join if they pass the same test.
+
+use super::graph::{Factor, Graph, Label};
+use super::intake::{Intake, Kind};
+use super::marginals::certain;
+use super::pairs::{self, Pair};
+use super::reweight::{self, Drop};
+use super::solve::{Solution, SolveError, solve};
+use crate::config::EstimateConfig;
+use crate::geometry::{PoseWithCovariance, Relative, Sim3};
+use crate::ids::{EntryId, FrameId, SubmapId};
+use crate::snapshot::PairStatus;
+use crate::wire::fact::ScaleKind;
+use std::collections::{BTreeMap, BTreeSet};
+use thiserror::Error;
+
+/// A frame's own trajectory of anchors.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameChain {
+    /// Whether its unit is the metre.
+    pub scale: ScaleKind,
+    /// `t_prev_this` of each anchor in the frame's unit; index 0 is `t_frame_anchor0`.
+    pub odometry: Vec<PoseWithCovariance>,
+}
+
+/// A measurement between two anchors that both endpoints agree on (or a sighting by its observer).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AgreedAlignment {
+    /// The log entry that states it.
+    pub entry: EntryId,
+    /// Target anchor.
+    pub i: SubmapId,
+    /// Source anchor.
+    pub j: SubmapId,
+    /// `t_i_j`.
+    pub t_i_j: Relative,
+}
+
+/// Everything the map depends on. Order within the vectors does not matter.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MapProblem {
+    /// All known frames.
+    pub frames: BTreeMap<FrameId, FrameChain>,
+    /// Agreed alignments between frames, and loop closures within one.
+    pub alignments: Vec<AgreedAlignment>,
+    /// Direct measurements of other robots.
+    pub sightings: Vec<AgreedAlignment>,
+}
+
+/// Why a measurement does not count.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+pub enum Unused {
+    /// Its mean is NaN, infinite, or of no valid rotation or scale.
+    #[error("holds a NaN, infinite or invalid number")]
+    NotFinite,
+    /// Its standard deviations are so large that it says nothing.
+    #[error("too uncertain to say anything")]
+    TooUncertain,
+    /// One of its anchors is not known (yet), or lies behind a broken step of its frame's odometry.
+    #[error("names an unknown submap")]
+    UnknownSubmap,
+    /// Both ends are one anchor.
+    #[error("ties a submap to itself")]
+    SelfLoop,
+    /// Another measurement with this entry id comes first in canonical order.
+    #[error("repeats an entry")]
+    RepeatsEntry,
+    /// An earlier entry aligns the same two submaps: the same data must not count twice.
+    #[error("aligns the same submaps as {0}")]
+    RepeatsPair(EntryId),
+    /// SE(3) between frames of different units, or SIM(3) between equal ones.
+    #[error("SE(3) needs equal units at both ends, SIM(3) different ones")]
+    Units,
+    /// A sighting within one frame.
+    #[error("observer and observed share a frame")]
+    SameFrame,
+    /// Its two frames are not merged.
+    #[error("its frames are not merged ({0:?})")]
+    Unmerged(PairStatus),
+    /// The frame-level consensus of its pair leaves it out.
+    #[error("contradicts the other alignments of its pair of frames")]
+    Outvoted,
+    /// A loop closure that contradicts the odometry between its ends.
+    #[error("contradicts the odometry between its ends (chi2 {0:.1})")]
+    Odometry(f64),
+    /// A loop closure that contradicts other loop closures.
+    #[error("contradicts other loop closures of its frame")]
+    OtherLoops,
+    /// Its pair of frames contradicts the chain of stronger pairs between the same frames.
+    #[error("its pair contradicts a loop of frames")]
+    FrameLoop,
+    /// It contradicts the rest of the map.
+    #[error("contradicts the rest of the map (leave-one-out chi2 {0:.1})")]
+    Contradicts(f64),
+    /// Too few alignments of its pair survived the joint estimate.
+    #[error("too few alignments of its pair of frames survive the joint estimate")]
+    TooFew,
+    /// Its component could not be solved; its frame conditions it worst.
+    #[error("the component could not be solved: {0}")]
+    Failed(SolveError),
+}
+
+/// A measurement and what became of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EdgeEstimate {
+    /// Alignment or sighting.
+    pub kind: Kind,
+    /// As it was given.
+    pub measurement: AgreedAlignment,
+    /// What its information was multiplied by; 0 if unused.
+    pub weight: f64,
+    /// Why it does not count; `None` if it does.
+    pub unused: Option<Unused>,
+}
+
+/// A pair of frames with at least one agreed alignment, `a < b`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PairEstimate {
+    /// First frame.
+    pub a: FrameId,
+    /// Second frame.
+    pub b: FrameId,
+    /// Merged, or why not.
+    pub status: PairStatus,
+    /// Agreed alignments that could be considered.
+    pub agreed: usize,
+    /// Alignments in the joint estimate.
+    pub used: usize,
+    /// log₁₀ of the number of false alarms of the consensus.
+    pub log10_nfa: Option<f64>,
+    /// `t_a_b` between the frames' origins: the joint estimate if their component holds both, the pair's own consensus
+    /// otherwise.
+    pub t_a_b: Option<Relative>,
+    /// The pair agrees with itself but contradicts a loop of stronger pairs, so it was left out.
+    pub contradicts_loop: bool,
+}
+
+/// Frames that are connected, solved together.
+#[derive(Clone, Debug)]
+struct Component {
+    frames: Vec<FrameId>,
+    solution: Option<Solution>,
+}
+
+/// The map.
+#[derive(Clone, Debug)]
+pub struct JointEstimate {
+    components: Vec<Component>,
+    component_of: BTreeMap<FrameId, usize>,
+    /// `t_frame_anchor0`.
+    origins: BTreeMap<FrameId, PoseWithCovariance>,
+    unknown_scale: BTreeSet<FrameId>,
+    pairs: Vec<PairEstimate>,
+    edges: Vec<EdgeEstimate>,
+    /// Weighted sum of squared residuals over all components.
+    pub chi2: f64,
+    /// Degrees of freedom over all components.
+    pub dof: usize,
+    /// Anchors.
+    pub nodes: usize,
+    /// Whether every component was solved and converged.
+    pub converged: bool,
+}
+
+/// Solves the map. Never fails: what cannot be used is listed in [`JointEstimate::edges`] with its reason.
+pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate {
+    let mut intake = Intake::new(problem);
+    let mut pairs = pairs::consensus(&mut intake, config);
+    let start = pairs::start(&intake, &pairs);
+    let mut map = Map::solve(&mut intake, &mut pairs, start, config);
+    let unknown_scale = intake.unknown_scale.clone();
+    if intake.admit_sightings(|i, j| map.relative(&unknown_scale, i, j)) {
+        map = Map::solve(&mut intake, &mut pairs, map.start, config);
+    }
+    JointEstimate::new(intake, pairs, map)
+}
+
+/// Solved components while measurements are still being dropped.
+struct Map {
+    solutions: Vec<(BTreeSet<FrameId>, Option<Solution>)>,
+    /// Latest `t_world_anchor`, the start of the next solve.
+    start: BTreeMap<SubmapId, Sim3>,
+}
+
+impl Map {
+    /// Solves, drops what contradicts the rest, and solves again until nothing does.
+    fn solve(
+        intake: &mut Intake,
+        pairs: &mut [Pair],
+        mut start: BTreeMap<SubmapId, Sim3>,
+        config: &EstimateConfig,
+    ) -> Self {
+        let mut round = 0;
+        loop {
+            let solved = solve_components(intake, &start, config.iterations_max);
+            let mut changed = false;
+            let mut solutions = Vec::new();
+            for (frames, solution) in solved {
+                match solution {
+                    Ok(solution) => {
+                        start.extend(solution.graph().nodes().iter().copied().zip(solution.values().iter().copied()));
+                        for Drop { label, chi2 } in reweight::contradictions(&solution, round) {
+                            changed |= intake.drop_edge(label, Unused::Contradicts(chi2));
+                        }
+                        solutions.push((frames, Some(solution)));
+                    }
+                    Err(error) => {
+                        changed |= intake.isolate_worst(&frames, Unused::Failed(error));
+                        solutions.push((frames, None));
+                    }
+                }
+            }
+            if !changed {
+                return Self { solutions, start };
+            }
+            pairs::demote(intake, pairs, config.alignments_min);
+            intake.drop_stray_sightings();
+            round += 1;
+        }
+    }
+
+    fn relative(&self, unknown_scale: &BTreeSet<FrameId>, i: SubmapId, j: SubmapId) -> Option<Relative> {
+        let holds = |s: &&(BTreeSet<FrameId>, Option<Solution>)| s.0.contains(&i.frame) && s.0.contains(&j.frame);
+        self.solutions.iter().find(holds)?.1.as_ref()?.relative(i, j, unknown_scale)
+    }
+}
+
+type Solved = (BTreeSet<FrameId>, Result<Solution, SolveError>);
+
+/// Builds and solves every component from the measurements that count at present.
+fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iterations_max: usize) -> Vec<Solved> {
+    let mut groups: BTreeMap<usize, BTreeSet<FrameId>> = BTreeMap::new();
+    for (frame, group) in intake.groups() {
+        groups.entry(group).or_default().insert(frame);
+    }
+    let used = || intake.edges.iter().filter(|e| e.is_used());
+    let solve_group = |members: BTreeSet<FrameId>| {
+        let nodes = members.iter().flat_map(|f| intake.chains[f].ids(*f)).collect();
+        let mut factors: Vec<Factor> = members.iter().flat_map(|f| intake.chains[f].factors(*f)).collect();
+        factors.extend(used().filter(|e| members.contains(&e.measurement.i.frame)).map(EdgeEstimate::factor));
+        let solution = match Graph::components(&nodes, &intake.unknown_scale, factors) {
+            Ok(mut graphs) if graphs.len() == 1 => {
+                let graph = graphs.remove(0);
+                let start = graph.nodes().iter().map(|id| start.get(id).copied().unwrap_or_else(Sim3::identity));
+                let start = start.collect();
+                solve(graph, start, iterations_max)
+            }
+            // Intake admits only what a graph accepts, and a chain is connected.
+            _ => Err(SolveError::NotFinite),
+        };
+        (members, solution)
+    };
+    groups.into_values().map(solve_group).collect()
+}
+
+impl EdgeEstimate {
+    fn factor(&self) -> Factor {
+        let AgreedAlignment { entry, i, j, t_i_j } = self.measurement;
+        let label = match self.kind {
+            Kind::Alignment => Label::Alignment(entry),
+            Kind::Sighting => Label::Sighting(entry),
+        };
+        Factor { label, i, j, t_i_j, weight: self.weight }
+    }
+
+    /// Whether it counts in the joint estimate.
+    pub fn is_used(&self) -> bool {
+        self.unused.is_none()
+    }
+}
+
+impl JointEstimate {
+    fn new(intake: Intake, pairs: Vec<Pair>, map: Map) -> Self {
+        let origins = intake.chains.iter().map(|(&f, chain)| (f, chain.origin)).collect();
+        let mut components = Vec::new();
+        let mut component_of = BTreeMap::new();
+        for (frames, solution) in map.solutions {
+            component_of.extend(frames.iter().map(|&f| (f, components.len())));
+            components.push(Component { frames: frames.into_iter().collect(), solution });
+        }
+        let solutions = || components.iter().filter_map(|c| c.solution.as_ref());
+        let mut out = Self {
+            chi2: solutions().map(|s| s.chi2).sum(),
+            dof: solutions().map(|s| s.dof).sum(),
+            nodes: intake.chains.values().map(|c| c.len()).sum(),
+            converged: components.iter().all(|c| c.solution.as_ref().is_some_and(|s| s.converged)),
+            components,
+            component_of,
+            origins,
+            unknown_scale: intake.unknown_scale,
+            pairs: Vec::new(),
+            edges: intake.edges,
+        };
+        out.pairs = pairs.into_iter().map(|pair| pair.estimate(&out)).collect();
+        out
+    }
+
+    /// The component of a frame; frames with the same number are connected. `None` for a frame without anchors.
+    pub fn component_of(&self, frame: FrameId) -> Option<usize> {
+        self.component_of.get(&frame).copied()
+    }
+
+    /// The frames of each component.
+    pub fn components(&self) -> impl ExactSizeIterator<Item = &[FrameId]> {
+        self.components.iter().map(|c| c.frames.as_slice())
+    }
+
+    /// `t_i_j` between two anchors of one component, cross-correlations included: rigid between metric frames and
+    /// within one frame (in its unit), a similarity otherwise.
+    pub fn relative(&self, i: SubmapId, j: SubmapId) -> Option<Relative> {
+        self.solution_of(i.frame, j.frame)?.relative(i, j, &self.unknown_scale)
+    }
+
+    /// `t_reference_anchor`: the anchor in the reference frame's coordinates.
+    pub fn anchor(&self, reference: FrameId, submap: SubmapId) -> Option<Relative> {
+        let origin = Relative::Metric(*self.origins.get(&reference)?);
+        let first = SubmapId { frame: reference, index: 0 };
+        if submap == first {
+            return Some(origin);
+        }
+        // The origin hangs on the first anchor alone, so its error is independent of all else.
+        Some(origin.compose(&self.relative(first, submap)?))
+    }
+
+    /// [`JointEstimate::anchor`] of every anchor in the reference's component, at the cost of a few of them.
+    pub fn anchors(&self, reference: FrameId) -> Vec<(SubmapId, Relative)> {
+        let first = SubmapId { frame: reference, index: 0 };
+        let (Some(origin), Some(solution)) = (self.origins.get(&reference), self.solution_of(reference, reference))
+        else {
+            return Vec::new();
+        };
+        let origin = Relative::Metric(*origin);
+        let place = |(id, t): (SubmapId, Relative)| (id, if id == first { origin } else { origin.compose(&t) });
+        solution.relatives_to(first, &self.unknown_scale).into_iter().map(place).collect()
+    }
+
+    /// `t_a_b` between the frames' origins.
+    pub fn frame(&self, a: FrameId, b: FrameId) -> Option<Relative> {
+        if a == b {
+            return self.component_of(a).map(|_| Relative::Metric(certain()));
+        }
+        let t_anchor0_b = Relative::Metric(*self.origins.get(&b)?).inverse();
+        Some(self.anchor(a, SubmapId { frame: b, index: 0 })?.compose(&t_anchor0_b))
+    }
+
+    /// Every pair of frames with an agreed alignment, ascending.
+    pub fn pairs(&self) -> &[PairEstimate] {
+        &self.pairs
+    }
+
+    /// Every alignment and sighting in canonical order, used or not.
+    pub fn edges(&self) -> &[EdgeEstimate] {
+        &self.edges
+    }
+
+    fn solution_of(&self, a: FrameId, b: FrameId) -> Option<&Solution> {
+        let component = self.component_of(a).filter(|c| self.component_of(b) == Some(*c))?;
+        self.components[component].solution.as_ref()
+    }
+}

@@ -1,0 +1,243 @@
+//! Pairs of frames: decides which of them merge before the joint estimate is solved (MATH §5, DESIGN §6.6).
+//!
+//! Each pair's alignments go through the frame-level consensus. Merged pairs are then taken from the strongest (lowest
+//! number of false alarms) to the weakest into a spanning forest, which also gives the start of the joint estimate. A
+//! pair that closes a loop of frames must agree with the stronger pairs around it (χ², 99.99 %), or it is left out: a
+//! false merge is worse than a missing one.
+
+use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim};
+use super::intake::{Chain, Intake, Kind};
+use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
+use super::loops;
+use super::marginals::is_rigid;
+use super::reweight::CHI2_9999;
+use crate::config::EstimateConfig;
+use crate::geometry::{Disagreement, Relative, Sim3};
+use crate::ids::{FrameId, SubmapId};
+use crate::snapshot::PairStatus;
+use std::collections::BTreeMap;
+
+/// A pair of frames, `a < b`, and what its own alignments say.
+pub(super) struct Pair {
+    pub(super) a: FrameId,
+    pub(super) b: FrameId,
+    /// Its alignments among the intake's edges.
+    members: Vec<usize>,
+    outcome: Outcome,
+    contradicts_loop: bool,
+    /// Part of the spanning forest.
+    in_tree: bool,
+}
+
+/// What the frame-level consensus says.
+pub(super) struct Outcome {
+    pub(super) status: PairStatus,
+    /// Indices among the alignments given.
+    pub(super) used: Vec<usize>,
+    /// By how much the standard deviations of the alignments are to be grown.
+    pub(super) sigma_scale: f64,
+    pub(super) log10_nfa: Option<f64>,
+    /// `t_a_b` between the frames' origins.
+    pub(super) t_a_b: Option<Relative>,
+}
+
+/// Runs the consensus on every pair, and marks the intake's edges accordingly.
+pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pair> {
+    loops::gate(intake);
+    let mut members: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
+    for (k, edge) in intake.edges.iter().enumerate() {
+        let (i, j) = (edge.measurement.i.frame, edge.measurement.j.frame);
+        if edge.kind == Kind::Alignment && edge.unused.is_none() && i != j {
+            members.entry((i.min(j), i.max(j))).or_default().push(k);
+        }
+    }
+    let pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
+        let outcome = decide(intake, (a, b), &members, config);
+        Pair { a, b, members, outcome, contradicts_loop: false, in_tree: false }
+    };
+    let mut pairs: Vec<Pair> = members.into_iter().map(pair).collect();
+    for pair in &pairs {
+        pair.mark(intake);
+    }
+    span(intake, &mut pairs);
+    pairs
+}
+
+/// `t_world_anchor` of every anchor: odometry, laid out along the spanning forest.
+pub(super) fn start(intake: &Intake, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3> {
+    let forest = Forest::of(pairs);
+    let mut world: BTreeMap<FrameId, Sim3> = BTreeMap::new();
+    for &frame in intake.chains.keys() {
+        if !world.contains_key(&frame) {
+            for (reached, t_frame_reached) in forest.reach(frame) {
+                world.insert(reached, t_frame_reached.map_or_else(Sim3::identity, |t| t.sim()));
+            }
+        }
+    }
+    let anchors = |(&frame, chain): (&FrameId, &Chain)| {
+        let t_world_frame = world.get(&frame).copied().unwrap_or_else(Sim3::identity);
+        let place = |id: SubmapId| {
+            let t_frame_anchor = chain.trajectory.pose(id.index as usize)?;
+            Some((id, t_world_frame * Sim3::from_se3(&t_frame_anchor)))
+        };
+        chain.ids(frame).filter_map(place).collect::<Vec<_>>()
+    };
+    intake.chains.iter().flat_map(anchors).collect()
+}
+
+/// Undoes merges of which too few alignments survive.
+pub(super) fn demote(intake: &mut Intake, pairs: &mut [Pair], alignments_min: usize) {
+    for pair in pairs.iter_mut().filter(|p| p.outcome.status == PairStatus::Merged) {
+        if pair.used(&intake.edges) < alignments_min {
+            pair.outcome.status = PairStatus::Inconsistent;
+            pair.refuse(intake, Unused::TooFew);
+        }
+    }
+}
+
+impl Pair {
+    /// Sets weights and reasons of the pair's alignments after the consensus.
+    fn mark(&self, intake: &mut Intake) {
+        for (k, &edge) in self.members.iter().enumerate() {
+            let edge = &mut intake.edges[edge];
+            if self.outcome.status != PairStatus::Merged {
+                edge.refuse(Unused::Unmerged(self.outcome.status));
+            } else if self.outcome.used.contains(&k) {
+                edge.weight = 1.0 / (self.outcome.sigma_scale * self.outcome.sigma_scale);
+            } else {
+                edge.refuse(Unused::Outvoted);
+            }
+        }
+    }
+
+    fn refuse(&self, intake: &mut Intake, reason: Unused) {
+        for &k in &self.members {
+            if intake.edges[k].unused.is_none() {
+                intake.edges[k].refuse(reason);
+            }
+        }
+    }
+
+    fn used(&self, edges: &[EdgeEstimate]) -> usize {
+        self.members.iter().filter(|&&k| edges[k].is_used()).count()
+    }
+
+    pub(super) fn estimate(self, map: &JointEstimate) -> PairEstimate {
+        PairEstimate {
+            a: self.a,
+            b: self.b,
+            status: self.outcome.status,
+            agreed: self.members.len(),
+            used: self.used(map.edges()),
+            log10_nfa: self.outcome.log10_nfa,
+            t_a_b: map.frame(self.a, self.b).or(self.outcome.t_a_b),
+            contradicts_loop: self.contradicts_loop,
+        }
+    }
+}
+
+/// Takes merged pairs into the forest, the strongest first, and leaves out those that contradict a loop.
+fn span(intake: &mut Intake, pairs: &mut [Pair]) {
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    let nfa = |k: usize| pairs[k].outcome.log10_nfa.unwrap_or(f64::INFINITY);
+    order.retain(|&k| pairs[k].outcome.status == PairStatus::Merged);
+    order.sort_by(|&x, &y| nfa(x).total_cmp(&nfa(y)).then(x.cmp(&y)));
+    for k in order {
+        let path = Forest::of(pairs).reach(pairs[k].a).remove(&pairs[k].b).flatten();
+        let Some(own) = pairs[k].outcome.t_a_b else { continue };
+        match path {
+            None => pairs[k].in_tree = true,
+            Some(path) if agree(&path.disagreement(&own)) => {}
+            Some(_) => {
+                pairs[k].contradicts_loop = true;
+                pairs[k].outcome.status = PairStatus::Inconsistent;
+                pairs[k].refuse(intake, Unused::FrameLoop);
+            }
+        }
+    }
+}
+
+fn agree(d: &Disagreement) -> bool {
+    d.distance_squared <= CHI2_9999[usize::from(d.degrees_of_freedom == 7)]
+}
+
+/// The spanning forest of merged frames.
+struct Forest(BTreeMap<FrameId, Vec<(FrameId, Relative)>>);
+
+impl Forest {
+    fn of(pairs: &[Pair]) -> Self {
+        let mut neighbours: BTreeMap<FrameId, Vec<(FrameId, Relative)>> = BTreeMap::new();
+        for pair in pairs.iter().filter(|p| p.in_tree) {
+            if let Some(t_a_b) = pair.outcome.t_a_b {
+                neighbours.entry(pair.a).or_default().push((pair.b, t_a_b));
+                neighbours.entry(pair.b).or_default().push((pair.a, t_a_b.inverse()));
+            }
+        }
+        Self(neighbours)
+    }
+
+    /// Every frame connected to `root`, with `t_root_frame` (`None` for the root itself) compounded along the way: its
+    /// covariance takes the pairs as independent, which overstates it where they share a trajectory.
+    fn reach(&self, root: FrameId) -> BTreeMap<FrameId, Option<Relative>> {
+        let mut reached = BTreeMap::from([(root, None)]);
+        let mut next = vec![root];
+        while let Some(frame) = next.pop() {
+            let so_far: Option<Relative> = reached[&frame];
+            for (other, t_frame_other) in self.0.get(&frame).into_iter().flatten() {
+                if !reached.contains_key(other) {
+                    let t_root_other = so_far.map_or(*t_frame_other, |t| t.compose(t_frame_other));
+                    reached.insert(*other, Some(t_root_other));
+                    next.push(*other);
+                }
+            }
+        }
+        reached
+    }
+}
+
+/// The frame-level consensus of one pair, in SE(3) or SIM(3) as its units ask.
+fn decide(intake: &Intake, (a, b): (FrameId, FrameId), members: &[usize], config: &EstimateConfig) -> Outcome {
+    let (alpha, beta) = (&intake.chains[&a].trajectory, &intake.chains[&b].trajectory);
+    let oriented = members.iter().map(|&k| orient(&intake.edges[k], a));
+    let config = FrameConsensusConfig::from(config);
+    if is_rigid(a, b, &intake.unknown_scale) {
+        let metric = |(i, j, t): (_, _, Relative)| t.metric().map(|&t_i_j| PairAlignment { i, j, t_i_j });
+        let alignments: Vec<_> = oriented.filter_map(metric).collect();
+        Outcome::of(align_frames(alpha, beta, &alignments, &config), Relative::Metric)
+    } else {
+        let alignments: Vec<_> = oriented.map(|(i, j, t)| PairAlignment { i, j, t_i_j: t.lifted() }).collect();
+        Outcome::of(align_frames_sim(alpha, beta, &alignments, &config), Relative::Similarity)
+    }
+}
+
+impl Outcome {
+    fn of<T>(outcome: FrameOutcome<T>, relative: impl Fn(T) -> Relative) -> Self {
+        let (status, consensus) = match outcome {
+            FrameOutcome::Merged(c) => (PairStatus::Merged, Some(c)),
+            FrameOutcome::Provisional(c) => (PairStatus::Provisional, Some(c)),
+            // Neither of two rivals is worth showing as the answer.
+            FrameOutcome::Ambiguous { .. } => (PairStatus::Ambiguous, None),
+            FrameOutcome::Inconsistent | FrameOutcome::None => (PairStatus::Inconsistent, None),
+        };
+        match consensus {
+            Some(c) => Self {
+                status,
+                used: c.used,
+                sigma_scale: c.covariance_scale,
+                log10_nfa: Some(c.log10_nfa),
+                t_a_b: Some(relative(c.t_alpha_beta)),
+            },
+            None => Self { status, used: Vec::new(), sigma_scale: 1.0, log10_nfa: None, t_a_b: None },
+        }
+    }
+}
+
+/// An alignment's anchors and measurement, turned so that `i` lies in the pair's first frame.
+fn orient(edge: &EdgeEstimate, a: FrameId) -> (usize, usize, Relative) {
+    let m = &edge.measurement;
+    if m.i.frame == a {
+        (m.i.index as usize, m.j.index as usize, m.t_i_j)
+    } else {
+        (m.j.index as usize, m.i.index as usize, m.t_i_j.inverse())
+    }
+}

@@ -1,0 +1,125 @@
+//! Robust re-weighting of the joint estimate: decides which alignments the rest of the map contradicts.
+//!
+//! With residual `r`, measurement covariance Σ and posterior covariance P of the predicted measurement, the
+//! leave-one-out statistic is `rᵀ (Σ − P)⁻¹ r`: it equals the innovation's Mahalanobis distance against the map solved
+//! without that measurement (deletion residuals of least squares), and needs no second solve. Directions in which the
+//! measurement is the map's only source have no redundancy and are not tested.
+
+use super::graph::{Edge, Label};
+use super::solve::Solution;
+use crate::geometry::sim3::{self, Matrix7, Vector7};
+use crate::geometry::{Relative, se3};
+use nalgebra::SMatrix;
+
+/// χ² quantiles at 99.9 %, 1 to 7 degrees of freedom.
+pub(super) const CHI2_999: [f64; 7] = [
+    10.827_566_170_662_733,
+    13.815_510_557_964_274,
+    16.266_236_196_238_13,
+    18.466_826_952_903_17,
+    20.515_005_652_432_873,
+    22.457_744_484_825_323,
+    24.321_886_347_856_854,
+];
+
+/// χ² quantiles at 99.99 %, 6 and 7 degrees of freedom.
+pub(super) const CHI2_9999: [f64; 2] = [27.856_341_235_954_06, 29.877_503_907_893_756];
+
+/// Share of a measurement's variance that the rest of the map must be able to predict before it is tested.
+const REDUNDANCY_MIN: f64 = 1e-4;
+
+/// After so many rounds of one drop per component, all that fail are dropped at once, so that hostile input cannot
+/// demand a solve for each of its measurements.
+const SINGLE_DROPS_MAX: usize = 32;
+
+/// A measurement to be left out.
+pub(super) struct Drop {
+    pub(super) label: Label,
+    /// Its leave-one-out χ².
+    pub(super) chi2: f64,
+}
+
+/// The measurements to leave out before solving again: the worst one (first in canonical order among equals), or all
+/// that fail once `round` has reached the limit.
+pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
+    let tested = solution.graph().edges().iter().filter(|e| e.factor.label != Label::Odometry);
+    let failing = tested.filter_map(|edge| {
+        let (chi2, dof) = leave_one_out(solution, edge)?;
+        let limit = CHI2_999.get(dof.checked_sub(1)?)?;
+        (chi2 > *limit).then_some((chi2 / limit, Drop { label: edge.factor.label, chi2 }))
+    });
+    let mut failing: Vec<(f64, Drop)> = failing.collect();
+    failing.sort_by(|a, b| b.0.total_cmp(&a.0));
+    if round < SINGLE_DROPS_MAX {
+        failing.truncate(1);
+    }
+    failing.into_iter().map(|(_, drop)| drop).collect()
+}
+
+/// The leave-one-out χ² of a measurement and the number of redundant directions.
+pub(super) fn leave_one_out(solution: &Solution, edge: &Edge) -> Option<(f64, usize)> {
+    let residual = edge.residual(solution.values());
+    let predicted = solution.covariance_between(edge.i, edge.j)?;
+    match &edge.factor.t_i_j {
+        Relative::Metric(p) => {
+            let r = residual.fixed_rows::<6>(0).into_owned();
+            let j = se3::right_jacobian_inv(&r);
+            let predicted = j * predicted.fixed_view::<6, 6>(0, 0) * j.transpose();
+            deletion(&r, &(p.covariance.matrix() / edge.factor.weight), &predicted)
+        }
+        Relative::Similarity(s) => {
+            let j: Matrix7 = sim3::right_jacobian_inv(&residual);
+            let r: Vector7 = residual;
+            deletion(&r, &(s.covariance.matrix() / edge.factor.weight), &(j * predicted * j.transpose()))
+        }
+    }
+}
+
+fn deletion<const N: usize>(
+    r: &SMatrix<f64, N, 1>,
+    measurement: &SMatrix<f64, N, N>,
+    predicted: &SMatrix<f64, N, N>,
+) -> Option<(f64, usize)> {
+    let l = measurement.cholesky()?.l();
+    let r = l.solve_lower_triangular(r)?;
+    let half = l.solve_lower_triangular(predicted)?;
+    let predicted = l.solve_lower_triangular(&half.transpose())?;
+    let redundancy = SMatrix::<f64, N, N>::identity() - (predicted + predicted.transpose()) * 0.5;
+    // In a basis of the redundancy's own directions. Dynamic, because the eigen-solver wants a statically smaller type.
+    let eigen = nalgebra::DMatrix::from_iterator(N, N, redundancy.iter().copied()).symmetric_eigen();
+    let (mut chi2, mut dof) = (0.0, 0);
+    for (k, &share) in eigen.eigenvalues.iter().enumerate() {
+        if share > REDUNDANCY_MIN {
+            let along: f64 = eigen.eigenvectors.column(k).iter().zip(r.iter()).map(|(v, x)| v * x).sum();
+            chi2 += along * along / share;
+            dof += 1;
+        }
+    }
+    Some((chi2, dof))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use statrs::distribution::{ChiSquared, ContinuousCDF};
+
+    #[test]
+    fn quantiles_are_those_of_chi_squared() {
+        let tail = |dof: usize, x: f64| ChiSquared::new(dof as f64).unwrap().sf(x);
+        for (k, &x) in CHI2_999.iter().enumerate() {
+            assert!((tail(k + 1, x) / 1e-3 - 1.0).abs() < 1e-9, "{k}: {}", tail(k + 1, x));
+        }
+        for (k, &x) in CHI2_9999.iter().enumerate() {
+            assert!((tail(k + 6, x) / 1e-4 - 1.0).abs() < 1e-9, "{k}: {}", tail(k + 6, x));
+        }
+    }
+
+    #[test]
+    fn a_source_without_redundancy_is_not_tested() {
+        let sigma = SMatrix::<f64, 6, 6>::identity();
+        let r = SMatrix::<f64, 6, 1>::repeat(1e-9);
+        assert_eq!(deletion(&r, &sigma, &sigma), Some((0.0, 0)));
+        let (chi2, dof) = deletion(&SMatrix::<f64, 6, 1>::repeat(1.0), &sigma, &(sigma * 0.5)).unwrap();
+        assert!(dof == 6 && (chi2 - 12.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,238 @@
+//! The contract between the core and its shells, and what the core promises under bad input.
+#![allow(missing_docs)]
+
+mod common;
+
+use common::{Wires, World, agent, drive, name, robot};
+use merganser_protocol::agent::Restored;
+use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Output, QueryKind, Record};
+use merganser_protocol::ids::{FrameId, Name, RobotId};
+use merganser_protocol::replica::Replica;
+use merganser_protocol::time::Instant;
+use merganser_protocol::wire::EntryBytes;
+use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
+use merganser_protocol::wire::messages::Message;
+use std::time::Duration;
+
+fn drain(agent: &mut merganser_protocol::agent::Agent) -> Vec<Output> {
+    std::iter::from_fn(|| agent.poll_output()).collect()
+}
+
+#[test]
+fn only_handle_makes_outputs_and_changes_the_timeout() {
+    let mut agent = agent(0, Restored::default());
+    agent.handle(Instant::ZERO, Input::Neighbour { robot: robot(1), up: true });
+    let first = drain(&mut agent);
+    assert!(!first.is_empty(), "contact is answered with an announcement");
+    let timeout = agent.poll_timeout();
+    assert!(timeout.is_some_and(|t| t > Instant::ZERO));
+    assert!(agent.poll_output().is_none());
+    assert_eq!(agent.poll_timeout(), timeout);
+    agent.handle(timeout.unwrap(), Input::Timeout);
+    assert!(agent.poll_timeout() > timeout, "a timeout that was served moves on");
+}
+
+#[test]
+fn nothing_is_published_before_it_is_durable() {
+    let (keyframes, _) = drive(&World::new(1), 0, 6);
+    let mut agent = agent(0, Restored::default());
+    agent.handle(Instant::ZERO, Input::Neighbour { robot: robot(1), up: true });
+    let _ = drain(&mut agent);
+    let mut held_back = Vec::new();
+    for input in keyframes.into_iter().map(Input::Keyframe).chain([Input::Command(Command::Flush)]) {
+        let mut inputs = vec![input];
+        while let Some(input) = inputs.pop() {
+            agent.handle(Instant::ZERO, input);
+            for output in drain(&mut agent) {
+                match output {
+                    Output::Run { id, job } => inputs.push(Input::JobDone { job: id, result: job.run() }),
+                    Output::Persist { batch, records } => held_back.push((batch, records)),
+                    Output::Publish { channel, .. } => assert_ne!(channel, Channel::Facts),
+                    _ => {}
+                }
+            }
+        }
+    }
+    assert!(held_back.len() >= 2);
+    assert_eq!(agent.status().entries, 0, "not durable, not held");
+    let (last, _) = held_back[held_back.len() - 1];
+    agent.handle(Instant::ZERO, Input::Persisted { up_to: last });
+    let published = drain(&mut agent);
+    assert!(published.iter().any(|o| matches!(o, Output::Publish { channel: Channel::Facts, .. })));
+    assert_eq!(agent.status().entries, held_back.len() as u64);
+}
+
+#[test]
+fn three_robots_merge_and_hold_the_same_map() {
+    let world = World::new(1);
+    let runs: Vec<_> = (0..3).map(|k| drive(&world, k, 19)).collect();
+    let mut wires = Wires::new((0..3).map(|k| agent(k, Restored::default())).collect());
+    for n in 0..19 {
+        for (k, (keyframes, _)) in runs.iter().enumerate() {
+            wires.input(k, Input::Keyframe(keyframes[n].clone()));
+        }
+        wires.run(Duration::from_secs(1));
+    }
+    for k in 0..3 {
+        wires.input(k, Input::Command(Command::Flush));
+    }
+    wires.run(Duration::from_secs(20));
+    let digest = wires.agents[0].digest();
+    for (k, agent) in wires.agents.iter().enumerate() {
+        assert_eq!(agent.digest(), digest);
+        let status = agent.status();
+        assert!(status.idle, "robot {k} still has {} things to do", status.pending);
+        assert_eq!(status.merged_with.len(), 2, "robot {k} merged with {:?}", status.merged_with);
+    }
+    let frames = wires.agents[0].snapshot(wires.now).frames;
+    for (k, (_, truth)) in runs.iter().enumerate().skip(1) {
+        let frame = frames.frames.iter().find(|f| f.robot == common::NAMES[k]).unwrap();
+        let found = frame.t_own_frame.as_ref().unwrap();
+        let t_own_frame = runs[0].1[0].inverse() * truth[0];
+        let error = nalgebra::Vector3::from(found.pose.translation) - t_own_frame.translation;
+        assert!(error.norm() < 0.15, "frame of robot {k} is off by {:.3} m", error.norm());
+    }
+}
+
+#[test]
+fn ten_thousand_facts_of_strangers_are_counted_reported_once_and_forgotten() {
+    let mut agent = agent(0, Restored::default());
+    let swarm = Name::new("test").unwrap();
+    let key = ed25519_dalek::SigningKey::from_bytes(&[99; 32]);
+    let stranger = RobotId::of_key(&key.verifying_key().to_bytes());
+    let roster = [(Name::new("stranger").unwrap(), key.verifying_key().to_bytes())];
+    let mut theirs = Replica::new(&swarm, roster.into_iter(), &common::config().gossip).unwrap();
+    let verdict = Fact::Verdict(VerdictFact {
+        alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: stranger, epoch: 1 }, seq: 0 },
+        outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
+    });
+    let entry = theirs.append(&key, 1, &verdict).unwrap().encode();
+    let bytes = Message::Facts(vec![EntryBytes(entry)]).encode();
+    let mut reports = 0;
+    for n in 0..10_000u64 {
+        let now = Instant::ZERO.after(Duration::from_millis(n));
+        agent.handle(now, Input::Received { from: stranger, channel: Channel::Facts, bytes: bytes.clone() });
+        for output in drain(&mut agent) {
+            match output {
+                Output::Event(Event::Rejected { peer, .. }) => {
+                    assert_eq!(peer, Some(stranger), "the warning names the peer");
+                    reports += 1;
+                }
+                Output::Persist { .. } => panic!("a stranger's fact must not reach the disk"),
+                _ => {}
+            }
+        }
+    }
+    let stats = agent.snapshot(Instant::ZERO).stats;
+    assert_eq!(stats.rejected.values().sum::<u64>(), 10_000);
+    assert_eq!(reports, 1, "one report per peer and ten seconds");
+    assert_eq!(agent.status().entries, 0);
+}
+
+#[test]
+fn garbage_is_refused_and_every_question_answered_exactly_once() {
+    let mut agent = agent(0, Restored::default());
+    let garbage: [&[u8]; 5] = [b"", b"x", &[0xff; 70_000], b"Mg\x63\x01abc", &[0; 64]];
+    let mut token = 0;
+    for bytes in garbage {
+        for kind in [QueryKind::Sync, QueryKind::Blob, QueryKind::Align] {
+            token += 1;
+            agent.handle(Instant::ZERO, Input::Asked { token: AskToken(token), kind, bytes: bytes.to_vec() });
+            let answers = drain(&mut agent)
+                .iter()
+                .filter(|o| matches!(o, Output::Answer { token: t, .. } if t.0 == token))
+                .count();
+            assert_eq!(answers, 1);
+        }
+        for channel in [Channel::Pose, Channel::Facts, Channel::Have] {
+            agent.handle(Instant::ZERO, Input::Received { from: robot(1), channel, bytes: bytes.to_vec() });
+            let _ = drain(&mut agent);
+        }
+    }
+    assert_eq!(agent.snapshot(Instant::ZERO).stats.rejected.values().sum::<u64>(), 30);
+}
+
+#[test]
+fn a_full_disk_turns_the_agent_into_a_listener_and_says_so() {
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    let mut agent = agent(0, Restored::default());
+    agent.handle(Instant::ZERO, Input::PersistFailed { batch: 1, reason: "no space left on device".into() });
+    let loud = drain(&mut agent);
+    assert!(loud.iter().any(|o| matches!(o, Output::Event(Event::ReceiveOnly { .. }))));
+    for keyframe in keyframes {
+        agent.handle(Instant::ZERO, Input::Keyframe(keyframe));
+        assert!(!drain(&mut agent).iter().any(|o| matches!(o, Output::Persist { .. } | Output::Run { .. })));
+    }
+    assert!(agent.status().receive_only);
+}
+
+#[test]
+fn a_restart_resumes_the_log_where_it_was_durable() {
+    let world = World::new(1);
+    let (keyframes, _) = drive(&world, 0, 19);
+    let mut wires = Wires::new(vec![agent(0, Restored::default()), agent(1, Restored::default())]);
+    for keyframe in &keyframes[..12] {
+        wires.input(0, Input::Keyframe(keyframe.clone()));
+    }
+    let before = wires.agents[0].status();
+    assert!(before.submaps >= 2);
+    let records: Vec<Record> = wires.disks[0].clone();
+    let mut again = agent(0, Restored { records, fresh_epoch: 77 });
+    assert_eq!(again.digest(), wires.agents[0].digest());
+    assert_eq!(again.frame(), wires.agents[0].frame(), "a store that survived keeps its epoch");
+    assert_eq!(again.status().submaps, before.submaps, "features survive, so that old submaps can still be aligned");
+    core::mem::swap(&mut wires.agents[0], &mut again);
+    wires.input(0, Input::Neighbour { robot: robot(1), up: true });
+    for keyframe in &keyframes[12..] {
+        wires.input(0, Input::Keyframe(keyframe.clone()));
+    }
+    wires.input(0, Input::Command(Command::Flush));
+    wires.run(Duration::from_secs(5));
+    assert!(wires.agents[0].status().submaps > before.submaps);
+    assert_eq!(wires.agents[1].digest(), wires.agents[0].digest(), "the peer accepts what the second life wrote");
+}
+
+#[test]
+fn a_lost_store_begins_a_new_epoch_above_what_peers_remember() {
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    let mut wires =
+        Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 5 }), agent(1, Restored::default())]);
+    for keyframe in &keyframes {
+        wires.input(0, Input::Keyframe(keyframe.clone()));
+    }
+    wires.run(Duration::from_secs(2));
+    assert_eq!(wires.agents[1].digest(), wires.agents[0].digest());
+    // The clock stood at an earlier date when the store was made anew: the epoch must still rise.
+    wires.agents[0] = agent(0, Restored { records: vec![], fresh_epoch: 3 });
+    wires.input(0, Input::Neighbour { robot: robot(1), up: true });
+    wires.run(Duration::from_secs(5));
+    assert!(wires.agents[0].frame().epoch > 5);
+    assert_eq!(wires.agents[1].digest(), wires.agents[0].digest());
+}
+
+#[test]
+fn the_same_inputs_give_the_same_outputs() {
+    let trace = || {
+        let world = World::new(3);
+        let mut wires = Wires::new((0..2).map(|k| agent(k, Restored::default())).collect());
+        for k in 0..2 {
+            for keyframe in drive(&world, k, 10).0 {
+                wires.input(k, Input::Keyframe(keyframe));
+            }
+            wires.input(k, Input::Command(Command::Flush));
+        }
+        wires.run(Duration::from_secs(5));
+        let snapshot = wires.agents[0].snapshot(wires.now);
+        (wires.published, serde_json::to_string(&snapshot).unwrap())
+    };
+    assert_eq!(trace(), trace());
+}
+
+#[test]
+fn the_roster_must_hold_the_robot_itself() {
+    let mut identity = common::identity(0);
+    identity.roster.remove(&name(0));
+    let result =
+        merganser_protocol::agent::Agent::new(common::config(), identity, 0, Restored::default(), Instant::ZERO);
+    assert!(result.is_err());
+}
