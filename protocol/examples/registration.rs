@@ -94,6 +94,8 @@ fn distance(relative: &Relative, truth: &Sim3) -> f64 {
 
 /// Processor time of this thread (Linux; elsewhere 0).
 fn cpu_seconds() -> f64 {
+    // The kernel brings the figure up to date when the thread yields.
+    std::thread::yield_now();
     let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
     text.split(' ').next().and_then(|ns| ns.parse::<f64>().ok()).unwrap_or(0.0) * 1e-9
 }

@@ -1,7 +1,238 @@
-//! stub
-fn main() {
-    let s = merganser_sim::scenario::Scenario::parse(include_str!("../scenarios/three.toml")).unwrap();
-    let t = std::time::Instant::now();
-    for r in merganser_sim::record::record(&s, 2, std::path::Path::new("/tmp/rec")).unwrap() { println!("{r:?}"); }
-    println!("{:?}", t.elapsed());
+//! `merganser-sim`: runs scenarios and writes the demo's recordings.
+//!
+//! Exit codes: 0 all invariants held, 1 one broke, 2 the command or the scenario cannot be used.
+
+use anyhow::{Context, bail};
+use clap::{Parser, Subcommand};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use merganser_protocol::agent::Agent;
+use merganser_sim::record::record;
+use merganser_sim::report::Report;
+use merganser_sim::scenario::Scenario;
+use merganser_sim::svg::picture;
+use merganser_sim::swarm::{Outcome, Swarm};
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+/// The scenario that the demo's recordings are made from, and the seed.
+const DEMO: &str = include_str!("../scenarios/three.toml");
+const DEMO_SEED: u64 = 1;
+
+/// The Merganser core on a virtual network, in virtual time.
+#[derive(Debug, Parser)]
+#[command(version, about)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run a scenario and check every invariant
+    Run {
+        /// The scenario file (see sim/scenarios)
+        scenario: PathBuf,
+        /// The seed that everything is drawn from
+        #[arg(long, default_value_t = 1, conflicts_with = "seeds")]
+        seed: u64,
+        /// Run a band of seeds, FIRST..END (without END)
+        #[arg(long, value_name = "FIRST..END", value_parser = parse_band)]
+        seeds: Option<Band>,
+        /// Write report.json and trajectories.svg here (a folder per seed for a band)
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
+        /// Run each seed twice and compare the traces
+        #[arg(long)]
+        twice: bool,
+    },
+    /// Write the demo's three recordings, the same bytes each time
+    Record {
+        /// Where the recordings' folders go
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// The seed
+        #[arg(long, default_value_t = DEMO_SEED)]
+        seed: u64,
+        /// Another scenario than the demo's
+        #[arg(long)]
+        scenario: Option<PathBuf>,
+    },
+}
+
+/// Seeds from the first up to, but without, the second.
+#[derive(Clone, Copy, Debug)]
+struct Band(u64, u64);
+
+fn parse_band(text: &str) -> Result<Band, String> {
+    let mend = || format!("{text:?} is no band of seeds: write 0..64");
+    let (first, end) = text.split_once("..").ok_or_else(mend)?;
+    let band = Band(first.parse().map_err(|_| mend())?, end.parse().map_err(|_| mend())?);
+    if band.0 < band.1 { Ok(band) } else { Err(mend()) }
+}
+
+fn main() -> ExitCode {
+    match dispatch(Cli::parse().command) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(error) => {
+            let _ = writeln!(std::io::stderr(), "merganser-sim: {error:#}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn dispatch(command: Command) -> anyhow::Result<bool> {
+    match command {
+        Command::Record { out, seed, scenario } => {
+            let scenario = match scenario {
+                Some(path) => load(&path)?,
+                None => Scenario::parse(DEMO)?,
+            };
+            for done in record(&scenario, seed, &out)? {
+                say(&format!(
+                    "{:<8} {} keyframes, {} points, {:.1} m in {:.1} s, {} bytes",
+                    done.robot, done.keyframes, done.points, done.metres, done.secs, done.bytes
+                ))?;
+            }
+            Ok(true)
+        }
+        Command::Run { scenario: path, seed, seeds, report, twice } => {
+            let scenario = load(&path)?;
+            say(&format!("# {} — every option of this run:\n{}", path.display(), toml::to_string(&scenario)?))?;
+            let band = seeds.unwrap_or(Band(seed, seed + 1));
+            let mut good = true;
+            for seed in band.0..band.1 {
+                let folder = report.as_ref().map(|dir| match seeds {
+                    Some(_) => dir.join(seed.to_string()),
+                    None => dir.clone(),
+                });
+                good &= run(&scenario, seed, &path, folder.as_deref(), twice, seeds.is_some())?;
+            }
+            Ok(good)
+        }
+    }
+}
+
+fn load(path: &Path) -> anyhow::Result<Scenario> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    Scenario::parse(&text).with_context(|| path.display().to_string())
+}
+
+/// Runs one seed. Returns whether all invariants held.
+fn run(
+    scenario: &Scenario,
+    seed: u64,
+    path: &Path,
+    folder: Option<&Path>,
+    twice: bool,
+    brief: bool,
+) -> anyhow::Result<bool> {
+    let began = std::time::Instant::now();
+    let outcome = simulate(scenario, seed)?;
+    let wall = began.elapsed().as_secs_f64();
+    let report = Report::of(&outcome);
+    if let Some(folder) = folder {
+        write(folder, &report, &outcome)?;
+    }
+    say(&line(&report, wall))?;
+    if !brief {
+        say(&table(&report))?;
+    }
+    if twice && simulate(scenario, seed)?.trace != outcome.trace {
+        bail!("seed {seed} gave two different traces; something outside the seed has an influence");
+    }
+    let Some(violation) = &report.violation else { return Ok(true) };
+    say(&format!(
+        "BROKEN   seed {seed}, at {:.3} s: {}\n         {}\nREPLAY   merganser-sim run {} --seed {seed}",
+        violation.at_secs,
+        violation.invariant,
+        violation.what,
+        path.display()
+    ))?;
+    Ok(false)
+}
+
+fn simulate(scenario: &Scenario, seed: u64) -> anyhow::Result<Outcome<Agent>> {
+    let swarm = Swarm::<Agent>::new(scenario.clone(), seed)?;
+    let bar = progress_bar(swarm.end().as_secs_f64())?;
+    let outcome = swarm.run(|now| bar.set_position(now.as_secs_f64() as u64));
+    bar.finish_and_clear();
+    Ok(outcome?)
+}
+
+fn progress_bar(secs: f64) -> anyhow::Result<ProgressBar> {
+    let hidden = !std::io::stderr().is_terminal();
+    let target = if hidden { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() };
+    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} virtual s, {elapsed}")?;
+    Ok(ProgressBar::with_draw_target(Some(secs as u64), target).with_style(style))
+}
+
+fn write(folder: &Path, report: &Report, outcome: &Outcome<Agent>) -> anyhow::Result<()> {
+    let put = |name: &str, text: String| {
+        let path = folder.join(name);
+        std::fs::create_dir_all(folder).and_then(|()| std::fs::write(&path, text))
+    };
+    put("report.json", serde_json::to_string_pretty(report)? + "\n").context("report.json")?;
+    put("trajectories.svg", picture(outcome)).context("trajectories.svg")
+}
+
+/// One line per seed.
+fn line(report: &Report, wall: f64) -> String {
+    let verdict = if report.violation.is_some() { "broken" } else { "good" };
+    let worst = report.frame_errors.iter().map(|e| e.metres).fold(0.0, f64::max);
+    let d2 = report.mean_d2.map_or_else(|| "-".to_owned(), |d2| format!("{d2:.1}"));
+    format!(
+        "seed {} {verdict}: {:.0} virtual s in {wall:.2} s ({:.1} simulated s per wall s), {} merged relations, worst \
+         {worst:.3} m, mean d² {d2}, trace {}",
+        report.seed,
+        report.ended_secs,
+        report.ended_secs / wall.max(1e-9),
+        report.frame_errors.len(),
+        &report.trace[..16]
+    )
+}
+
+fn table(report: &Report) -> String {
+    let mut text = format!("\n{:<10} {:>8} {:>8} {:>10}  merged with\n", "robot", "submaps", "facts", "bytes sent");
+    for robot in &report.robots {
+        text += &format!(
+            "{:<10} {:>8} {:>8} {:>10}  {}\n",
+            robot.name,
+            robot.submaps,
+            robot.entries,
+            report.bytes_sent(&robot.name),
+            robot.merged_with.join(" ")
+        );
+    }
+    text += &format!("\n{:<22} {:>8} {:>7} {:>9}\n", "relation", "m", "deg", "d²");
+    for e in &report.frame_errors {
+        let d2 = e.d2.map_or_else(|| "-".to_owned(), |d2| format!("{d2:.2}"));
+        text +=
+            &format!("{:<22} {:>8.4} {:>7.3} {:>9}\n", format!("{} -> {}", e.own, e.frame), e.metres, e.degrees, d2);
+    }
+    let f = &report.faults;
+    text += &format!(
+        "\nfaults: {} lost, {} in bursts, {} doubled, {} reordered, {} blocked, {} over capacity, {} unanswered, {} \
+         killed, {} restarted, {} wiped, {} paused, {} disk refusals, {} new frames, {} left\n",
+        f.lost,
+        f.burst_lost,
+        f.duplicated,
+        f.reordered,
+        f.blocked,
+        f.over_capacity,
+        f.unanswered,
+        f.killed,
+        f.restarted,
+        f.wiped,
+        f.paused,
+        f.disk_refused,
+        f.new_frames,
+        f.left
+    );
+    text
+}
+
+fn say(text: &str) -> std::io::Result<()> {
+    writeln!(std::io::stdout().lock(), "{text}")
 }

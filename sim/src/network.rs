@@ -150,7 +150,14 @@ impl Network {
     }
 
     /// Sends a message of `bytes` bytes: the times at which copies of it arrive.
-    pub fn send(&mut self, now: Instant, from: usize, to: usize, bytes: usize, counts: &mut FaultCounts) -> Vec<Instant> {
+    pub fn send(
+        &mut self,
+        now: Instant,
+        from: usize,
+        to: usize,
+        bytes: usize,
+        counts: &mut FaultCounts,
+    ) -> Vec<Instant> {
         if !self.is_open(from, to) {
             counts.blocked += 1;
             return Vec::new();
@@ -276,12 +283,8 @@ mod tests {
 
     #[test]
     fn losses_in_bursts_come_together() {
-        let options = NetworkOptions {
-            bursts_per_min: 30.0,
-            burst_ms_mean: 500.0,
-            burst_loss: 1.0,
-            ..NetworkOptions::default()
-        };
+        let options =
+            NetworkOptions { bursts_per_min: 30.0, burst_ms_mean: 500.0, burst_loss: 1.0, ..NetworkOptions::default() };
         let (arrivals, counts) = traffic(options, 3);
         // 20 bad spells of 0.5 s in 40 s, less what one takes from the other: a fifth of the time.
         assert!((400..1300).contains(&counts.burst_lost), "{counts:?}");
@@ -295,7 +298,8 @@ mod tests {
         let options = NetworkOptions { bytes_per_sec: 8000.0, queue_ms_max: 300.0, ..NetworkOptions::default() };
         let (arrivals, counts) = traffic(options, 4);
         assert!(near(counts.over_capacity, 0.5), "{counts:?}");
-        let worst = (0u64..).zip(&arrivals).flat_map(|(k, t)| t.iter().map(move |t| t.since(at_10ms(k)))).max().unwrap();
+        let worst =
+            (0u64..).zip(&arrivals).flat_map(|(k, t)| t.iter().map(move |t| t.since(at_10ms(k)))).max().unwrap();
         assert!((millis(300.0)..millis(450.0)).contains(&worst), "{worst:?}");
     }
 

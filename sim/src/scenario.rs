@@ -15,8 +15,7 @@ pub const ROBOTS_MAX: usize = 1000;
 /// Longest run, s.
 pub const DURATION_MAX_SECS: f64 = 24.0 * 3600.0;
 /// Names of the first robots; later ones are `robot-11` and so on.
-const NAMES: [&str; 10] =
-    ["alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa"];
+const NAMES: [&str; 10] = ["alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa"];
 
 /// A whole scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

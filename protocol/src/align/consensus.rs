@@ -10,14 +10,15 @@ use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig, Standi
 
 /// Size of the first prefix of matches searched; each next is four times as large.
 const PREFIX_FIRST: usize = 128;
-/// σ levels: σ_max over 16, 8, 4, 2, 1. The tight graph is also the cheap one.
+/// σ levels: σ_max over 1, 2, 4, 8, 16.
 const LEVELS: u32 = 5;
+/// Relative cost of a level, or doubt that it is the right one: σ_max is commonly 3–10 × the truth, and the tighter
+/// graph is the cheaper.
+const LEVEL_COSTS: [usize; LEVELS as usize] = [20, 10, 4, 4, 8];
 /// Candidates evaluated on all matches, per step.
 const EVALUATED: usize = 3;
-/// Ratio of a SIM(3) search step's largest to its smallest scale.
-const SCALE_STEP: f64 = 1.1;
 /// Matches of a rival expected in the prefix in which it is sought.
-const RIVAL_EXPECTED: f64 = 24.0;
+const RIVAL_EXPECTED: f64 = 20.0;
 /// An inlier lies within so many σ̂: the 99 % quantile of χ₃, and a margin.
 const INLIER_REACH: f64 = 4.0;
 
@@ -63,12 +64,10 @@ struct Stage {
 
 impl<'a> Search<'a> {
     fn new(matches: &'a Matches, config: &'a SolverConfig) -> Self {
-        let (with_scale, scale_range) = match config.model {
-            Model::Rigid => (false, (1.0, 1.0)),
-            Model::Similarity { scale_min, scale_max } => (true, (scale_min, scale_max)),
-        };
+        let with_scale = matches!(config.model, Model::Similarity { .. });
+        let scale_range = config.model.scale_range();
         let sigma_max = config.sigma_max;
-        let volume = matches.volume(4.0 * sigma_max);
+        let volume = matches.chance.volume(2.0 * sigma_max);
         Self {
             context: Context { matches, with_scale, scale_range, sigma_max, volume },
             config,
@@ -110,17 +109,14 @@ impl<'a> Search<'a> {
     fn first_accepted(&mut self, pool: &[u32]) -> Option<(Evaluated, Stage)> {
         let bar = self.config.log10_nfa_provisional.unwrap_or(self.config.log10_nfa_max);
         let mut best: Option<(Evaluated, Stage)> = None;
-        for prefix in prefixes(pool.len()) {
-            for level in (0..LEVELS).rev() {
-                let stage = Stage { prefix, level };
-                let Some(found) = self.step(pool, stage, bar, None) else { continue };
-                let nfa = found.significance.log10_nfa;
-                if best.as_ref().is_none_or(|(b, _)| nfa < b.significance.log10_nfa) {
-                    best = Some((found, stage));
-                }
-                if nfa <= self.config.log10_nfa_max {
-                    return best;
-                }
+        for stage in stages(pool.len()) {
+            let Some(found) = self.step(pool, stage, bar, None) else { continue };
+            let nfa = found.significance.log10_nfa;
+            if best.as_ref().is_none_or(|(b, _)| nfa < b.significance.log10_nfa) {
+                best = Some((found, stage));
+            }
+            if nfa <= self.config.log10_nfa_max {
+                return best;
             }
         }
         best
@@ -130,19 +126,17 @@ impl<'a> Search<'a> {
     fn step(&mut self, pool: &[u32], stage: Stage, bar: f64, taken: Option<&[bool]>) -> Option<Evaluated> {
         let sigma = self.config.sigma_max / f64::from(1_u32 << stage.level);
         let prefix = &pool[..stage.prefix.min(pool.len())];
+        let step = Step { sigma, hypotheses_max: self.config.hypotheses_max };
+        let mut candidates = core::mem::take(&mut self.candidates);
+        self.sampler.propose(&self.context, prefix, &step, &mut candidates);
         let mut best: Option<Evaluated> = None;
-        for scale in scale_ranges(self.context.scale_range) {
-            let step = Step { sigma, scale, hypotheses_max: self.config.hypotheses_max };
-            let mut candidates = core::mem::take(&mut self.candidates);
-            self.sampler.propose(&self.context, prefix, &step, &mut candidates);
-            for candidate in candidates.iter().take(EVALUATED) {
-                let Some(found) = self.evaluate(candidate, bar, taken) else { continue };
-                if best.as_ref().is_none_or(|b| found.significance.log10_nfa < b.significance.log10_nfa) {
-                    best = Some(found);
-                }
+        for candidate in candidates.iter().take(EVALUATED) {
+            let Some(found) = self.evaluate(candidate, bar, taken) else { continue };
+            if best.as_ref().is_none_or(|b| found.significance.log10_nfa < b.significance.log10_nfa) {
+                best = Some(found);
             }
-            self.candidates = candidates;
         }
+        self.candidates = candidates;
         best
     }
 
@@ -184,8 +178,11 @@ impl<'a> Search<'a> {
     }
 
     fn conclude(&mut self, best: Evaluated) -> Result<Alignment, Refusal> {
-        let fit = refine::reweight(&self.context, best.fit, self.config.weighting, &mut self.refine);
-        let Some(Estimate { relative, eigenvalues, .. }) = covariance::estimate(&self.context, &fit) else {
+        let reweighted = refine::reweight(&self.context, &best.fit, self.config.weighting, &mut self.refine)
+            .and_then(|fit| covariance::estimate(&self.context, &fit).map(|estimate| (fit, estimate)))
+            .filter(|(_, estimate)| estimate.rotation_sigma <= self.config.rotation_sigma_max);
+        let plain = || covariance::estimate(&self.context, &best.fit).map(|estimate| (best.fit.clone(), estimate));
+        let Some((fit, Estimate { relative, eigenvalues, .. })) = reweighted.or_else(plain) else {
             return Err(Refusal::Degenerate { rotation_sigma: f64::INFINITY });
         };
         let matches = self.context.matches;
@@ -205,15 +202,12 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Prefix lengths searched: 128, 512, … and all.
-fn prefixes(n: usize) -> impl Iterator<Item = usize> {
+/// Prefixes 128, 512, … and all, each at every σ level, cheapest and likeliest first.
+fn stages(n: usize) -> Vec<Stage> {
     let growing = core::iter::successors(Some(PREFIX_FIRST), |p| p.checked_mul(4));
-    growing.take_while(move |p| p * 3 / 2 < n).chain([n])
-}
-
-/// Narrow scale ranges that cover the whole range.
-fn scale_ranges((low, high): (f64, f64)) -> impl Iterator<Item = (f64, f64)> {
-    let count = (libm::log(high / low) / libm::log(SCALE_STEP)).ceil().max(1.0);
-    let step = libm::pow(high / low, 1.0 / count);
-    (0..count as u32).map(move |k| (low * libm::pow(step, f64::from(k)), low * libm::pow(step, f64::from(k + 1))))
+    let prefixes = growing.take_while(|p| p * 3 / 2 < n).chain([n]);
+    let mut stages: Vec<Stage> =
+        prefixes.flat_map(|prefix| (0..LEVELS).map(move |level| Stage { prefix, level })).collect();
+    stages.sort_by_key(|s| s.prefix * LEVEL_COSTS[s.level as usize]);
+    stages
 }

@@ -15,6 +15,10 @@ mod have;
 mod log;
 mod restore;
 mod set;
+#[cfg(test)]
+mod testing;
+#[cfg(test)]
+mod tests;
 
 pub use fork::ForkProof;
 pub use restore::{Damage, RestoreError};

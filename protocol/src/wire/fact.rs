@@ -81,6 +81,7 @@ pub struct VerdictFact {
 }
 
 /// What an independent alignment of the same pair gave.
+#[expect(clippy::large_enum_variant, reason = "refusals are the exception; a box would cost every measurement")]
 #[derive(Clone, Debug, PartialEq)]
 pub enum VerdictOutcome {
     /// Its own `t_i_j` (same direction as the alignment's).

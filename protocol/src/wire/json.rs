@@ -1,12 +1,13 @@
-//! How messages look to people: hexadecimal ids, poses as translation, quaternion and standard deviations.
+//! How messages look to people: hexadecimal ids, poses as translation, quaternion, covariance and standard deviations.
 
 use super::beacon::Beacon;
 use super::entry::Entry;
 use super::fact::{Fact, VerdictOutcome};
 use super::have::{HaveVector, Head};
-use crate::geometry::{PoseWithCovariance, Relative};
+use crate::geometry::{PoseWithCovariance, Relative, Sim3};
 use crate::ids::{Hash, RobotId};
 use core::fmt::Display;
+use nalgebra::SMatrix;
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 
@@ -110,11 +111,20 @@ fn pose(p: &PoseWithCovariance) -> Value {
 }
 
 fn relative(r: &Relative) -> Value {
-    let t = r.sim();
-    let sigmas: Vec<f64> = match r {
-        Relative::Metric(p) => p.covariance.sigmas().iter().copied().collect(),
-        Relative::Similarity(s) => s.covariance.sigmas().iter().copied().collect(),
-    };
+    match r {
+        Relative::Metric(p) => estimate(&r.sim(), p.covariance.matrix()),
+        Relative::Similarity(s) => estimate(&r.sim(), s.covariance.matrix()),
+    }
+}
+
+/// As `snapshot::RelationView`: the covariance is its upper triangle, row by row, tangent order (ρ, φ[, λ]).
+fn estimate<const N: usize>(t: &Sim3, p: &SMatrix<f64, N, N>) -> Value {
     let translation: [f64; 3] = t.translation.into();
-    json!({ "translation": translation, "rotation": t.rotation.xyzw(), "scale": t.scale, "sigmas": sigmas })
+    let covariance: Vec<f64> = (0..N).flat_map(|r| (r..N).map(move |c| p[(r, c)])).collect();
+    let sigmas: Vec<f64> = (0..N).map(|i| p[(i, i)].sqrt()).collect();
+    json!({
+        "pose": { "translation": translation, "rotation": t.rotation.xyzw(), "scale": t.scale },
+        "covariance": covariance,
+        "sigmas": sigmas,
+    })
 }

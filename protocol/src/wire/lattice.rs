@@ -5,7 +5,7 @@
 //! Rounding L could make P smaller in some direction; the encoder therefore rounds the factor of `P + δ diag(P)` with
 //! the smallest δ of a doubling sequence for which the result dominates P: **decoded ⪰ P**, and
 //! `decoded ⪯ P + 2δ diag(P)`. Row-wise Cauchy–Schwarz bounds the δ needed by 2 N^1.5 2^−BITS: 2.8e-5 of a variance for
-//! the 20 bits of facts, 3 % for the 10 bits of beacons; what is found is usually a tenth of that.
+//! the 20 bits of facts, 3 % for the 10 bits of beacons.
 //!
 //! Products of such integers are exact in f64, and so is the Cholesky factorisation of a decoded matrix: what was once
 //! decoded encodes to the same integers again. That makes decode ∘ encode a projection, to the bit.

@@ -11,6 +11,7 @@ use crate::ids::{Hash, SubmapId};
 use serde::{Deserialize, Serialize};
 
 /// A message.
+#[expect(clippy::large_enum_variant, reason = "messages are short-lived and never kept in numbers")]
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "message", content = "body", rename_all = "snake_case")]
 pub enum Message {

@@ -6,6 +6,8 @@ pub mod beacon;
 pub mod entry;
 pub mod fact;
 pub mod frame;
+#[cfg(test)]
+mod golden;
 pub mod have;
 mod json;
 mod lattice;
@@ -13,6 +15,10 @@ pub mod limits;
 pub mod messages;
 pub mod payload;
 pub mod pose;
+#[cfg(test)]
+pub(crate) mod samples;
+#[cfg(test)]
+mod tests;
 
 pub use beacon::{Beacon, BeaconContent};
 pub use entry::{Entry, EntryBytes, EntryContent, EntryError, SwarmTag};

@@ -236,7 +236,7 @@ fn far_outliers_do_not_inflate_significance() {
 
 #[test]
 fn weak_consensus_is_provisional_only_on_request() {
-    let asked = SolverConfig { support_min: 4.0, log10_nfa_provisional: Some(-1.0), ..config(2.0 * SIGMA) };
+    let asked = SolverConfig { support_min: 4.0, log10_nfa_provisional: Some(0.0), ..config(2.0 * SIGMA) };
     let (mut right, mut wrong_accepted) = (0, 0);
     for seed in 0..20 {
         let case = Case::uniform(900 + seed, 100, 5, 1.0);

@@ -1,0 +1,203 @@
+//! Agents on real Zenoh, over loopback: everything that one core says reaches the other as it was said, every question
+//! ends in one answer, floods are dropped and counted, and `…/in/*` is for this host alone.
+
+mod common;
+
+use common::{PATIENCE, Puppet, keyframe, name, start, swarm, until};
+use merganser::config::{FileConfig, ZenohConfig};
+use merganser::driver::Clock;
+use merganser::host::Host;
+use merganser::keys;
+use merganser::link::session::{self, Role};
+use merganser::observation::KeyframeMessage;
+use merganser::store::Store;
+use merganser_protocol::agent::io::{Channel, Input, Output, QueryId, QueryKind};
+use merganser_protocol::ids::RobotId;
+use merganser_protocol::snapshot::StatusView;
+use std::collections::BTreeMap;
+use std::time::Duration;
+use zenoh::Session;
+
+async fn puppet(config: &FileConfig, core: &Puppet) -> Host {
+    let store = Store::open(&config.store.path, &config.swarm, &config.robot).unwrap();
+    Host::assemble(config, core.clone(), store, None, Clock::start()).await.unwrap()
+}
+
+fn id(config: &FileConfig) -> RobotId {
+    RobotId::of_key(&config.roster[&config.robot].to_bytes())
+}
+
+async fn onlooker(config: &FileConfig) -> Session {
+    let zenoh = ZenohConfig { connect: config.zenoh.listen.clone(), multicast: false, ..ZenohConfig::default() };
+    session::open(&zenoh, Role::Onlooker).await.unwrap()
+}
+
+/// A view of `robot`, asked for over Zenoh.
+async fn view(session: &Session, robot: &str, view: &str) -> Option<serde_json::Value> {
+    let key = keys::of(&name("test"), &name(robot), &format!("view/{view}"));
+    let replies = session.get(key).timeout(Duration::from_secs(5)).await.unwrap();
+    let reply = replies.recv_async().await.ok()?;
+    let sample = reply.result().ok()?;
+    assert_eq!(sample.encoding().to_string(), format!("application/json;merganser.view.{view}/1"));
+    Some(serde_json::from_slice(&sample.payload().to_bytes()).unwrap())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn channels_questions_and_presence_cross_the_network_unchanged() {
+    let dir = tempfile::tempdir().unwrap();
+    let configs = swarm(dir.path(), &["alpha", "beta", "gamma"]); // gamma never starts
+    let (a, b) = (Puppet::default(), Puppet { answers: true, ..Puppet::default() });
+    let alpha = puppet(&configs[0], &a).await;
+    let beta = puppet(&configs[1], &b).await;
+    let up = |robot: RobotId, wanted: bool| move |input: &Input| matches!(input, Input::Neighbour { robot: r, up } if *r == robot && *up == wanted);
+    until("alpha sees beta", async || a.has_heard(up(id(&configs[1]), true))).await;
+    until("beta sees alpha", async || b.has_heard(up(id(&configs[0]), true))).await;
+
+    for (channel, content) in [(Channel::Pose, 1_u8), (Channel::Facts, 2), (Channel::Have, 3)] {
+        let sent = vec![content; 40_000 * usize::from(channel == Channel::Facts) + 20];
+        let heard = |input: &Input| matches!(input, Input::Received { from, channel: c, bytes } if *from == id(&configs[0]) && *c == channel && *bytes == sent);
+        // Drop on congestion is allowed, so say it until it is heard.
+        until("a broadcast", async || {
+            a.say(Output::Publish { channel, bytes: sent.clone() });
+            b.has_heard(heard)
+        })
+        .await;
+    }
+    for (number, kind) in keys::QUERIES.into_iter().enumerate() {
+        let (query, peer) = (QueryId(number as u64), id(&configs[1]));
+        a.say(Output::Ask { query, peer, kind, bytes: vec![1, 2, number as u8] });
+        let answered = |input: &Input| matches!(input, Input::Answered { query: q, bytes: Some(bytes) } if *q == query && *bytes == [number as u8, 2, 1]);
+        until("an answer", async || a.has_heard(answered)).await;
+        assert!(b.has_heard(|input| matches!(input, Input::Asked { kind: k, .. } if *k == kind)));
+    }
+    for (query, peer) in [(QueryId(100), id(&configs[2])), (QueryId(101), RobotId([0; 8]))] {
+        a.say(Output::Ask { query, peer, kind: QueryKind::Sync, bytes: vec![] });
+        let none = |input: &Input| matches!(input, Input::Answered { query: q, bytes: None } if *q == query);
+        until("the answer that there is none", async || a.has_heard(none)).await;
+    }
+    assert!(!a.has_heard(|input| matches!(input, Input::Received { from, .. } if *from == id(&configs[0]))), "an echo");
+
+    beta.stop().await.unwrap();
+    until("alpha misses beta", async || a.has_heard(up(id(&configs[1]), false))).await;
+    alpha.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_is_dropped_and_counted_while_the_core_keeps_answering() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut configs = swarm(dir.path(), &["alpha", "beta"]);
+    configs[1].driver.queue = 16;
+    let a = Puppet::default();
+    let b = Puppet { answers: true, slow: Duration::from_millis(5), ..Puppet::default() };
+    let alpha = puppet(&configs[0], &a).await;
+    let beta = puppet(&configs[1], &b).await;
+    let mut asked = 0;
+    until("drops", async || {
+        for _ in 0..500 {
+            a.say(Output::Publish { channel: Channel::Facts, bytes: vec![7; 100] });
+        }
+        asked += 1;
+        a.say(Output::Ask { query: QueryId(asked), peer: id(&configs[1]), kind: QueryKind::Sync, bytes: vec![5] });
+        beta.inbox().drops.counts().get("queue full: alpha").is_some_and(|count| *count > 1000)
+    })
+    .await;
+    let answer = |input: &Input| matches!(input, Input::Answered { bytes: Some(bytes), .. } if *bytes == [5]);
+    until("an answer through the flood", async || a.has_heard(answer)).await;
+    let ends = |input: &Input| matches!(input, Input::Answered { .. });
+    until("every question ended", async || a.heard.lock().unwrap().iter().filter(|i| ends(i)).count() as u64 == asked)
+        .await;
+    alpha.stop().await.unwrap();
+    beta.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn strangers_and_oversized_messages_stop_at_the_edge() {
+    let dir = tempfile::tempdir().unwrap();
+    let configs = swarm(dir.path(), &["alpha", "beta"]);
+    let core = Puppet::default();
+    let alpha = puppet(&configs[0], &core).await;
+    let session = onlooker(&configs[0]).await;
+    let counted = |reason: &str| alpha.inbox().drops.counts().keys().any(|counted| counted.contains(reason));
+    until("the refusals", async || {
+        for (robot, length) in [("stranger", 10), ("beta", 200_000)] {
+            session.put(keys::of(&name("test"), &name(robot), "facts"), vec![1; length]).await.unwrap();
+        }
+        let _ = session.get(keys::of(&name("test"), &name("alpha"), "sync")).await; // no payload
+        counted("not in the roster") && counted("beta broadcast more than") && counted("without a payload")
+    })
+    .await;
+    assert!(!core.has_heard(|input| matches!(input, Input::Received { .. } | Input::Asked { .. })));
+    session::close(&session, PATIENCE).await;
+    alpha.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_robots_own_slam_feeds_it_in_json_and_postcard_from_this_host_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut configs = swarm(dir.path(), &["alpha", "beta"]);
+    configs[1].zenoh.input_interfaces = vec!["none0".into()]; // as if we were another computer
+    let alpha = start(&configs[0], None).await;
+    let beta = start(&configs[1], None).await;
+    let session = onlooker(&configs[0]).await;
+    until("both robots", async || {
+        view(&session, "alpha", "status").await.is_some() && view(&session, "beta", "status").await.is_some()
+    })
+    .await;
+    let send = async |robot: &str, bytes: Vec<u8>, encoding: &str| {
+        let key = keys::of(&name("test"), &name(robot), "in/keyframe");
+        session.put(key, bytes).encoding(encoding).await.unwrap();
+    };
+    let keyframes = async |robot: &str| view(&session, robot, "status").await.map(|v| v["keyframes"].as_u64().unwrap());
+    let message = |index| KeyframeMessage::from(&keyframe(0, index));
+
+    for robot in ["beta", "alpha"] {
+        send(robot, serde_json::to_vec(&message(0)).unwrap(), "application/json").await;
+        send(robot, postcard::to_stdvec(&message(1)).unwrap(), "application/octet-stream").await;
+        send(robot, b"{}".to_vec(), "application/json").await;
+        send(robot, b"hello".to_vec(), "text/plain").await;
+    }
+    until("both keyframes", async || keyframes("alpha").await == Some(2)).await;
+    let counts = async |robot: &str| {
+        let stats = view(&session, robot, "stats").await.unwrap();
+        serde_json::from_value::<BTreeMap<String, u64>>(stats["shell"].clone()).unwrap()
+    };
+    until("the refusals", async || {
+        let counts = counts("alpha").await;
+        let refused = |reason: &str| counts.keys().any(|counted| counted.contains(reason));
+        refused("in/keyframe: JSON") && refused("neither application/json nor")
+    })
+    .await;
+    assert_eq!(keyframes("beta").await, Some(0), "beta was sent the same, before alpha");
+    assert!(counts("beta").await.is_empty(), "refused before it reached us");
+    session::close(&session, PATIENCE).await;
+    alpha.stop().await.unwrap();
+    beta.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn views_are_published_as_json_while_somebody_subscribes() {
+    let dir = tempfile::tempdir().unwrap();
+    let configs = swarm(dir.path(), &["alpha"]);
+    let alpha = start(&configs[0], None).await;
+    alpha.inbox().feed(Input::Keyframe(keyframe(0, 0))).await;
+    let session = onlooker(&configs[0]).await;
+    let samples = session.declare_subscriber("merganser/v1/*/*/view/status").await.unwrap();
+    let sample = tokio::time::timeout(PATIENCE, samples.recv_async()).await.unwrap().unwrap();
+    assert_eq!(sample.key_expr().as_str(), "merganser/v1/test/alpha/view/status");
+    assert_eq!(sample.encoding().to_string(), "application/json;merganser.view.status/1");
+    let status: StatusView = serde_json::from_slice(&sample.payload().to_bytes()).unwrap();
+    assert_eq!((status.robot.as_str(), status.swarm.as_str()), ("alpha", "test"));
+    for view_name in keys::VIEWS {
+        assert!(view(&session, "alpha", view_name).await.is_some(), "{view_name}");
+    }
+    let all = session.get("merganser/v1/test/*/view/*").await.unwrap();
+    let mut names = Vec::new();
+    while let Ok(reply) = all.recv_async().await {
+        names.push(reply.result().unwrap().key_expr().as_str().rsplit('/').next().unwrap().to_string());
+    }
+    names.sort();
+    assert_eq!(names, ["frames", "graph", "map", "poses", "stats", "status"]);
+    drop(samples);
+    session::close(&session, PATIENCE).await;
+    alpha.stop().await.unwrap();
+}

@@ -1,0 +1,455 @@
+//! Hostile bytes: every truncation, every flipped bit, false lengths, other encodings of the same content.
+
+use super::fact::*;
+use super::frame::{FrameKind, MAGIC, VERSION, WireError};
+use super::limits::*;
+use super::samples::{self, entry_of, key};
+use super::*;
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
+use crate::ids::Hash;
+use crate::time::Stamp;
+use nalgebra::{SMatrix, Vector3};
+use proptest::prelude::*;
+
+fn entry() -> Entry {
+    entry_of(0, 3, &samples::facts()[0].1)
+}
+
+/// A LEB128 varint.
+fn varint(mut value: u64) -> Vec<u8> {
+    let mut out = Vec::new();
+    while value >= 128 {
+        out.push(value as u8 | 128);
+        value >>= 7;
+    }
+    out.push(value as u8);
+    out
+}
+
+fn framed(kind: FrameKind, parts: &[&[u8]]) -> Vec<u8> {
+    let mut bytes = vec![MAGIC[0], MAGIC[1], VERSION, kind as u8];
+    parts.iter().for_each(|part| bytes.extend_from_slice(part));
+    bytes
+}
+
+#[test]
+fn messages_are_refused_when_cut_or_continued_at_any_byte() {
+    for (name, message) in samples::messages() {
+        let bytes = message.encode();
+        for len in 0..bytes.len() {
+            assert!(Message::decode(&bytes[..len]).is_err(), "{name} cut to {len}");
+        }
+        let mut longer = bytes.clone();
+        longer.push(0);
+        assert!(Message::decode(&longer).is_err(), "{name} continued");
+    }
+}
+
+#[test]
+fn entries_are_refused_when_cut_or_continued_at_any_byte() {
+    let key = key(0).verifying_key();
+    let sound = |bytes: &[u8]| Entry::decode(bytes).is_ok_and(|entry| entry.verify(&key).is_ok());
+    for (_, fact) in samples::facts() {
+        let mut bytes = entry_of(0, 3, &fact).encode();
+        assert!(sound(&bytes));
+        for len in 0..bytes.len() {
+            assert!(!sound(&bytes[..len]), "cut to {len}");
+        }
+        bytes.push(0);
+        assert!(!sound(&bytes));
+    }
+}
+
+#[test]
+fn every_flipped_bit_of_an_entry_or_beacon_is_noticed() {
+    let public = key(0).verifying_key();
+    let bytes = entry().encode();
+    for bit in 0..8 * bytes.len() {
+        let mut flipped = bytes.clone();
+        flipped[bit / 8] ^= 1 << (bit % 8);
+        assert!(!Entry::decode(&flipped).is_ok_and(|entry| entry.verify(&public).is_ok()), "bit {bit}");
+    }
+    let bytes = Message::Pose(samples::beacon()).encode();
+    for bit in 0..8 * bytes.len() {
+        let mut flipped = bytes.clone();
+        flipped[bit / 8] ^= 1 << (bit % 8);
+        if let Ok(Message::Pose(beacon)) = Message::decode(&flipped) {
+            assert!(!beacon.verify(&public, SwarmTag::of(&samples::swarm())), "bit {bit}");
+        }
+    }
+}
+
+#[test]
+fn claims_of_a_gigabyte_are_refused() {
+    let huge = varint(1 << 30);
+    let hash = [0; 32];
+    for (kind, parts) in [
+        (FrameKind::Facts, vec![&huge[..]]),
+        (FrameKind::Facts, vec![&[1], &huge]),
+        (FrameKind::SyncRequest, vec![&[0, 0], &huge]),
+        (FrameKind::SyncReply, vec![&huge]),
+        (FrameKind::SyncReply, vec![&[0], &huge]),
+        (FrameKind::SyncReply, vec![&[0, 1], &huge]),
+        (FrameKind::BlobReply, vec![&hash, &[0, 0], &huge]),
+    ] {
+        let error = Message::decode(&framed(kind, &parts)).unwrap_err();
+        assert_eq!(error.reason(), "malformed", "{kind:?}: {error}");
+    }
+    // The same inside an entry and inside a payload.
+    let (mut bytes, payload_len) = (entry().encode(), entry().payload().len());
+    let at = bytes.len() - 64 - payload_len - varint(payload_len as u64).len();
+    bytes.splice(at..at + varint(payload_len as u64).len(), huge.clone());
+    assert_eq!(Entry::decode(&bytes).unwrap_err().reason(), "entry_malformed");
+    let mut payload = entry().payload().to_vec();
+    payload.splice(payload.len() - 121.., huge);
+    assert_eq!(Fact::from_payload(payload::KIND_SUBMAP, &payload).unwrap_err().reason(), "fact_malformed");
+}
+
+#[test]
+fn the_frame_is_checked_before_its_body() {
+    let good = Message::AlignReply { status: AlignStatus::Busy }.encode();
+    assert!(Message::decode(&good).is_ok());
+    let with = |at: usize, value: u8| {
+        let mut bytes = good.clone();
+        bytes[at] = value;
+        Message::decode(&bytes).unwrap_err()
+    };
+    assert_eq!(Message::decode(b"mg"), Err(WireError::TooShort { len: 2 }));
+    assert_eq!(with(0, b'x'), WireError::Magic { got: *b"xg" });
+    for got in [0, 2, 255] {
+        assert_eq!(with(2, got), WireError::Version { got });
+        assert_eq!(with(3, got | 128), WireError::Kind { got: got | 128 });
+    }
+    assert_eq!(with(4, 5).reason(), "malformed", "an unknown status");
+}
+
+#[test]
+fn every_kind_has_a_limit_that_is_checked_on_both_sides() {
+    for kind in FrameKind::ALL {
+        let len = kind.len_max();
+        let error = |len: usize| Message::decode(&framed(kind, &[&vec![0; len - HEADER_LEN]])).unwrap_err();
+        assert_ne!(error(len).reason(), "too_long");
+        assert_eq!(error(len + 1), WireError::TooLong { kind, len: len + 1, max: len });
+    }
+    let blob = |len: usize, total: u32| {
+        Message::decode(&Message::BlobReply { hash: Hash::default(), offset: 0, total, bytes: vec![7; len] }.encode())
+    };
+    assert!(blob(BLOB_LEN_MAX, BLOB_LEN_MAX as u32).is_ok());
+    assert!(blob(BLOB_LEN_MAX + 1, BLOB_LEN_MAX as u32 + 1).is_err());
+    assert!(blob(0, BLOB_LEN_MAX as u32 + 1).is_err());
+    assert!(blob(2, 1).is_err(), "a piece beyond its blob");
+    let facts = |n: usize| Message::decode(&Message::Facts(vec![EntryBytes(vec![7; 10]); n]).encode());
+    assert!(facts(ENTRIES_PER_DELTA_MAX).is_ok());
+    assert!(facts(ENTRIES_PER_DELTA_MAX + 1).is_err());
+    let one = |len: usize| Message::decode(&Message::Facts(vec![EntryBytes(vec![7; len])]).encode());
+    assert!(one(ENTRY_LEN_MAX).is_ok());
+    assert!(one(ENTRY_LEN_MAX + 1).is_err());
+    let heads = |n: u32| {
+        let head = |epoch| (samples::frame(0, epoch), Head::Log { len: 1, tag: [0; 4] });
+        let have = HaveVector { heads: (0..n).map(head).collect(), ..HaveVector::default() };
+        Message::decode(&Message::SyncRequest(have).encode())
+    };
+    assert!(heads(HEADS_MAX as u32).is_ok());
+    assert!(heads(HEADS_MAX as u32 + 1).is_err());
+}
+
+#[test]
+fn the_largest_contents_fit_their_frames() {
+    let far = crate::ids::FrameId { robot: crate::ids::RobotId([255; 8]), epoch: u32::MAX };
+    let head = |k: usize| {
+        let frame = crate::ids::FrameId { epoch: u32::MAX - (HEADS_MAX - k) as u32, ..far };
+        (frame, Head::Log { len: u32::MAX, tag: [255; 4] })
+    };
+    let have = HaveVector { after: None, until: Some(far), heads: (0..HEADS_MAX).map(head).collect() };
+    assert!(Message::decode(&Message::SyncRequest(have).encode()).is_ok());
+    let root = HaveRoot { robot: far.robot, root: [255; 8], count: u64::MAX, tick: u64::MAX };
+    assert!(Message::decode(&Message::Have(root).encode()).is_ok());
+    let content = BeaconContent {
+        anchor: crate::ids::SubmapId {
+            frame: crate::ids::FrameId { epoch: u32::MAX, ..samples::frame(0, 0) },
+            index: u32::MAX,
+        },
+        stamp: Stamp(i64::MIN),
+        counter: u64::MAX,
+        t_anchor_body: samples::estimate(),
+    };
+    let beacon = Beacon::sign(&key(0), SwarmTag::of(&samples::swarm()), &content).unwrap();
+    let bytes = Message::Pose(beacon).encode();
+    assert!(bytes.len() <= BEACON_LEN_MAX, "{} bytes", bytes.len());
+    assert!(Message::decode(&bytes).is_ok());
+    let content = |len: usize| EntryContent {
+        swarm: SwarmTag::of(&samples::swarm()),
+        id: crate::ids::EntryId { frame: crate::ids::FrameId { epoch: u32::MAX, ..far }, seq: u32::MAX },
+        kind: 255,
+        floor: u32::MAX,
+        previous: Hash([255; 32]),
+        payload: vec![0; len],
+    };
+    let bytes = Entry::sign(&key(0), content(PAYLOAD_LEN_MAX)).unwrap().encode();
+    assert!(bytes.len() <= ENTRY_LEN_MAX && Entry::decode(&bytes).is_ok());
+    assert!(Entry::sign(&key(0), content(PAYLOAD_LEN_MAX + 1)).is_err());
+}
+
+#[test]
+fn other_encodings_of_the_same_content_are_refused() {
+    // tick = 12 as a two-byte varint.
+    let mut bytes = samples::messages().into_iter().find(|(name, _)| *name == "have").unwrap().1.encode();
+    assert_eq!(bytes.pop(), Some(12));
+    bytes.extend([12 | 128, 0]);
+    assert_eq!(Message::decode(&bytes), Err(WireError::NonCanonical { kind: FrameKind::Have }));
+
+    // seq = 3, the byte before the kind and the floor, likewise; even if its origin signs that encoding.
+    let bytes = entry().encode();
+    let at = 1 + 8 + 8 + varint(203_000_000).len();
+    assert_eq!(bytes[at], 3);
+    let mut body = bytes[..bytes.len() - 64].to_vec();
+    body.splice(at..=at, [3 | 128, 0]);
+    body.extend([0; 64]);
+    assert_eq!(Entry::decode(&body), Err(EntryError::NonCanonical));
+
+    // A quaternion (0.8, 0, 0, 0.6) stated as if its last component were the largest.
+    let Fact::Submap(mut fact) = samples::submap_fact(ScaleKind::Metric) else { unreachable!() };
+    fact.odometry.pose.rotation = So3::identity();
+    let mut payload = Fact::Submap(fact).to_payload().unwrap();
+    let at = 1 + 9 + varint(2_000_000_000).len() + 24;
+    assert_eq!(payload[at..at + 4], [3, 0, 0, 0]);
+    payload.splice(at + 1..at + 2, varint(2 * (0.8 * f64::from(1 << 27)) as u64));
+    assert_eq!(Fact::from_payload(payload::KIND_SUBMAP, &payload), Err(FactError::NonCanonical));
+}
+
+#[test]
+fn heads_must_rise_and_lie_in_their_range() {
+    let decode = |change: &dyn Fn(&mut HaveVector)| {
+        let mut have = samples::have();
+        change(&mut have);
+        Message::decode(&Message::SyncRequest(have).encode()).map(|_| ()).map_err(|e| e.reason())
+    };
+    assert_eq!(decode(&|_| {}), Ok(()));
+    assert_eq!(decode(&|have| have.heads.reverse()), Err("value"));
+    assert_eq!(decode(&|have| have.heads.push(*have.heads.last().unwrap())), Err("value"));
+    assert_eq!(decode(&|have| have.after = Some(have.heads[0].0)), Err("value"));
+    assert_eq!(decode(&|have| have.until = Some(have.heads[0].0)), Err("value"));
+    assert_eq!(decode(&|have| have.until = have.heads.last().map(|(frame, _)| *frame)), Ok(()));
+}
+
+#[test]
+fn foreign_entries_are_named_as_such() {
+    let entry = entry();
+    assert!(entry.verify(&key(0).verifying_key()).is_ok());
+    assert_eq!(entry.verify(&key(1).verifying_key()), Err(EntryError::Signature));
+    let mut unsigned = entry.encode();
+    let len = unsigned.len();
+    unsigned[len - 64..].fill(0);
+    let unsigned = Entry::decode(&unsigned).unwrap();
+    assert_eq!(unsigned.verify(&key(0).verifying_key()), Err(EntryError::Signature));
+    let mut newer = entry.encode();
+    newer[0] = 2;
+    assert_eq!(Entry::decode(&newer), Err(EntryError::Version(2)));
+}
+
+#[test]
+fn kinds_of_a_newer_version_are_carried() {
+    let content = EntryContent {
+        swarm: SwarmTag::of(&samples::swarm()),
+        id: crate::ids::EntryId { frame: samples::frame(0, 1), seq: 0 },
+        kind: 77,
+        floor: 0,
+        previous: Hash::default(),
+        payload: b"from the future".to_vec(),
+    };
+    let entry = Entry::sign(&key(0), content).unwrap();
+    let back = Entry::decode(&entry.encode()).unwrap();
+    assert_eq!(back, entry);
+    assert_eq!(back.payload(), b"from the future");
+    assert_eq!(back.fact(), Err(FactError::UnknownKind(77)));
+}
+
+#[test]
+fn facts_with_unacceptable_values_are_refused_both_ways() {
+    let Fact::Submap(good) = samples::submap_fact(ScaleKind::Metric) else { unreachable!() };
+    let refused = |change: &dyn Fn(&mut SubmapFact)| {
+        let mut fact = good.clone();
+        change(&mut fact);
+        Fact::Submap(fact).to_payload().is_err()
+    };
+    assert!(!refused(&|_| {}));
+    assert!(!refused(&|f| f.summary = vec![0; SUMMARY_LEN_MAX]));
+    assert!(refused(&|f| f.summary = vec![0; SUMMARY_LEN_MAX + 1]));
+    assert!(!refused(&|f| f.stamps = [Stamp(i64::MIN), Stamp(-1)]));
+    assert!(refused(&|f| f.stamps.reverse()));
+    assert!(refused(&|f| f.extent[1] = f32::NAN));
+    assert!(refused(&|f| f.extent[1] = -1.0));
+    assert!(refused(&|f| f.odometry.pose.translation.x = f64::NAN));
+    assert!(!refused(&|f| f.odometry.pose.translation.x = TRANSLATION_MAX));
+    assert!(refused(&|f| f.odometry.pose.translation.x = 1.001 * TRANSLATION_MAX));
+
+    // The same on the way in: NaN for the first coordinate, which follows index, stamp and duration.
+    let mut payload = Fact::Submap(good).to_payload().unwrap();
+    let at = 1 + 9 + varint(2_000_000_000).len();
+    payload[at..at + 8].copy_from_slice(&f64::NAN.to_le_bytes());
+    assert_eq!(Fact::from_payload(payload::KIND_SUBMAP, &payload).unwrap_err().reason(), "fact_estimate");
+
+    let alignment = |change: &dyn Fn(&mut AlignmentFact)| {
+        let sample = samples::facts().into_iter().find(|(name, _)| *name == "alignment_similarity").unwrap().1;
+        let Fact::Alignment(mut fact) = sample else { unreachable!() };
+        change(&mut fact);
+        Fact::Alignment(fact).to_payload().is_err()
+    };
+    assert!(!alignment(&|_| {}));
+    assert!(alignment(&|f| f.j = f.i));
+    assert!(alignment(&|f| f.sigma = f32::INFINITY));
+    assert!(alignment(&|f| f.log10_nfa = f32::NEG_INFINITY));
+    for scale in [0.0, -1.0, f64::NAN, 1e7] {
+        assert!(alignment(&|f| f.t_i_j = Relative::Similarity(SimWithCovariance {
+            sim: Sim3 { scale, ..samples::similarity().sim },
+            ..samples::similarity()
+        })));
+    }
+}
+
+#[test]
+fn entries_are_batched_within_the_limits() {
+    let entries: Vec<Vec<u8>> = (0..3000).map(|k| vec![k as u8; 20 + 9 * (k % 220)]).collect();
+    let messages = Message::facts(entries.clone());
+    let mut back = Vec::new();
+    for message in &messages {
+        let Message::Facts(batch) = Message::decode(&message.encode()).unwrap() else { panic!("not facts") };
+        back.extend(batch.into_iter().map(|entry| entry.0));
+    }
+    assert_eq!(back, entries);
+    let total: usize = entries.iter().map(Vec::len).sum();
+    assert!(messages.len() <= total / (MESSAGE_LEN_MAX - ENTRY_LEN_MAX) + 1);
+    assert!(Message::facts([]).is_empty());
+    assert!(Message::facts([vec![0; ENTRY_LEN_MAX + 1]]).is_empty());
+}
+
+#[test]
+fn messages_read_as_json() {
+    for (name, message) in samples::messages() {
+        let text = serde_json::to_string(&message).unwrap();
+        assert!(!text.contains("error"), "{name}: {text}");
+    }
+    let (_, message) = samples::messages().swap_remove(1);
+    let value = serde_json::to_value(&message).unwrap();
+    assert_eq!(value["message"], "facts");
+    assert_eq!(value["body"][0]["kind"], "submap");
+    assert_eq!(value["body"][0]["fact"]["keypoint_count"], 256);
+}
+
+fn pose() -> impl Strategy<Value = Se3> {
+    let t = proptest::array::uniform3(-1e3..1e3f64);
+    (t, proptest::array::uniform4(-1.0..1.0f64))
+        .prop_filter_map("no rotation", |(t, q)| Some(Se3::new(So3::from_xyzw(q)?, Vector3::from(t))))
+}
+
+fn covariance<const N: usize>() -> impl Strategy<Value = Covariance<N>> {
+    (proptest::collection::vec(-1.0..1.0f64, N * N), -4.0..1.0f64).prop_filter_map("singular", |(v, decade)| {
+        let b = SMatrix::<f64, N, N>::from_vec(v) * 10f64.powf(decade);
+        Covariance::new(b * b.transpose()).ok()
+    })
+}
+
+fn rigid() -> impl Strategy<Value = PoseWithCovariance> {
+    (pose(), covariance()).prop_map(|(pose, covariance)| PoseWithCovariance { pose, covariance })
+}
+
+fn relative() -> impl Strategy<Value = Relative> {
+    let similarity = (pose(), 0.01..100.0f64, covariance()).prop_map(|(pose, scale, covariance)| SimWithCovariance {
+        sim: Sim3::new(pose.rotation, pose.translation, scale),
+        covariance,
+    });
+    prop_oneof![rigid().prop_map(Relative::Metric), similarity.prop_map(Relative::Similarity)]
+}
+
+fn fact() -> impl Strategy<Value = Fact> {
+    let submap = (rigid(), any::<(u32, i64, u32, u16)>(), proptest::collection::vec(any::<u8>(), 0..=SUMMARY_LEN_MAX))
+        .prop_map(|(odometry, (index, first, lasting, keypoint_count), summary)| {
+            let first = first >> 1;
+            Fact::Submap(SubmapFact {
+                index,
+                stamps: [Stamp(first), Stamp(first + i64::from(lasting))],
+                odometry,
+                extent: [1.0, 2.0, 3.0],
+                blob: Hash::of(&summary),
+                summary,
+                keypoint_count,
+                scale: ScaleKind::Unknown,
+            })
+        });
+    let alignment =
+        (relative(), 0.0..10.0f32, any::<u16>(), -300.0..0.0f32).prop_map(|(t_i_j, sigma, support, nfa)| {
+            let blobs = [Hash::of(b"i"), Hash::of(b"j")];
+            let (i, j) = (samples::submap(0, 7), samples::submap(1, 4));
+            Fact::Alignment(AlignmentFact { i, j, t_i_j, sigma, support, log10_nfa: nfa, blobs })
+        });
+    let verdict = (relative(), 0.0..10.0f32, any::<(u16, u32)>()).prop_map(|(t_i_j, sigma, (support, seq))| {
+        let outcome = VerdictOutcome::Measured { t_i_j, sigma, support };
+        Fact::Verdict(VerdictFact { alignment: crate::ids::EntryId { frame: samples::frame(2, seq), seq }, outcome })
+    });
+    let sighting = (rigid(), any::<i64>()).prop_map(|(t_i_j, stamp)| {
+        let (i, j) = (samples::submap(0, 7), samples::submap(1, 4));
+        Fact::Sighting(SightingFact { stamp: Stamp(stamp), i, j, t_i_j })
+    });
+    prop_oneof![submap, alignment, verdict, sighting]
+}
+
+proptest! {
+    #[test]
+    fn a_fact_read_once_never_changes_again(fact in fact()) {
+        let payload = fact.to_payload().unwrap();
+        let read = Fact::from_payload(fact.kind(), &payload).unwrap();
+        prop_assert_eq!(read.to_payload().unwrap(), payload, "encode is not the inverse of parse");
+        if let (Fact::Submap(a), Fact::Submap(b)) = (&fact, &read) {
+            prop_assert_eq!(a.odometry.pose.translation, b.odometry.pose.translation);
+            prop_assert!((a.odometry.pose.rotation.inverse() * b.odometry.pose.rotation).angle() < 1e-7);
+            prop_assert_eq!((a.index, a.stamps, &a.summary), (b.index, b.stamps, &b.summary));
+        }
+    }
+
+    #[test]
+    fn a_beacon_read_once_never_changes_again(t_anchor_body in rigid(), counter in any::<u64>(), stamp in any::<i64>()) {
+        let content = BeaconContent { anchor: samples::submap(0, 9), stamp: Stamp(stamp), counter, t_anchor_body };
+        let swarm = SwarmTag::of(&samples::swarm());
+        let beacon = Beacon::sign(&key(0), swarm, &content).unwrap();
+        let Message::Pose(read) = Message::decode(&Message::Pose(beacon).encode()).unwrap() else { panic!() };
+        prop_assert_eq!(read, beacon);
+        prop_assert!(read.verify(&key(0).verifying_key(), swarm));
+        prop_assert!(!read.verify(&key(1).verifying_key(), swarm));
+        prop_assert!(!read.verify(&key(0).verifying_key(), SwarmTag::of(&crate::ids::Name::new("other").unwrap())));
+        prop_assert!((read.t_anchor_body.pose.translation - t_anchor_body.pose.translation).norm() < 1e-3);
+    }
+
+    #[test]
+    fn any_bytes_decode_to_something_that_encodes_to_them_or_not_at_all(
+        kind in 0u8..12, body in proptest::collection::vec(any::<u8>(), 0..200)
+    ) {
+        let bytes = [&[MAGIC[0], MAGIC[1], VERSION, kind][..], &body].concat();
+        if let Ok(message) = Message::decode(&bytes) {
+            prop_assert_eq!(message.encode(), bytes);
+        }
+        let _ = Entry::decode(&body);
+        let _ = Fact::from_payload(kind, &body);
+    }
+
+    #[test]
+    fn damaged_messages_decode_canonically_or_not_at_all(which in 0usize..14, at in any::<prop::sample::Index>(), value in any::<u8>()) {
+        let samples = samples::messages();
+        let mut bytes = samples[which % samples.len()].1.encode();
+        let at = at.index(bytes.len());
+        bytes[at] = value;
+        if let Ok(message) = Message::decode(&bytes) {
+            prop_assert_eq!(message.encode(), bytes);
+        }
+    }
+
+    #[test]
+    fn damaged_payloads_parse_canonically_or_not_at_all(which in 0usize..12, at in any::<prop::sample::Index>(), value in any::<u8>()) {
+        let (_, fact) = samples::facts().swap_remove(which);
+        let mut payload = fact.to_payload().unwrap();
+        let at = at.index(payload.len());
+        payload[at] = value;
+        if let Ok(read) = Fact::from_payload(fact.kind(), &payload) {
+            prop_assert_eq!(read.to_payload().unwrap(), payload);
+        }
+    }
+}

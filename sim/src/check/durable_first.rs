@@ -1,0 +1,135 @@
+//! Nothing leaves a robot before it is durable there (DESIGN §8.5). No message is decoded: a message that contains the
+//! bytes of a record that its sender's disk does not hold yet is a leak, whether the record was handed to the disk
+//! before the message left or soon after.
+
+use super::{Check, Seen};
+use merganser_protocol::agent::io::{Output, Record};
+use merganser_protocol::ids::Hash;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+/// Messages remembered per robot, to be held against records that come later.
+const SENT_MAX: usize = 64;
+/// Shorter records could be found in a message by chance.
+const RECORD_LEN_MIN: usize = 24;
+
+/// See the module.
+#[derive(Debug, Default)]
+pub struct DurableFirst {
+    robots: BTreeMap<usize, Robot>,
+}
+
+#[derive(Debug, Default)]
+struct Robot {
+    /// Records handed to the disk, by batch.
+    waiting: VecDeque<(u64, Vec<Vec<u8>>)>,
+    /// Records the disk holds: one may be stored twice.
+    durable: BTreeSet<Hash>,
+    sent: VecDeque<Vec<u8>>,
+}
+
+impl Check for DurableFirst {
+    fn name(&self) -> &'static str {
+        "durable first"
+    }
+
+    fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
+        let state = self.robots.entry(robot).or_default();
+        match seen {
+            Seen::Started | Seen::Died => {
+                state.waiting.clear();
+                state.sent.clear();
+            }
+            Seen::Wiped => state.durable.clear(),
+            Seen::Durable(batch) => {
+                while state.waiting.front().is_some_and(|(number, _)| number <= batch) {
+                    let records = state.waiting.pop_front().map(|(_, records)| records).unwrap_or_default();
+                    state.durable.extend(records.iter().map(|bytes| Hash::of(bytes)));
+                }
+            }
+            Seen::Output(Output::Persist { batch, records }) => {
+                let new = |bytes: &Vec<u8>| !state.durable.contains(&Hash::of(bytes));
+                let needles: Vec<Vec<u8>> = records.iter().filter_map(sendable).filter(new).collect();
+                if let Some(needle) = needles.iter().find(|n| state.sent.iter().any(|message| contains(message, n))) {
+                    return Err(format!("robot {robot}: sent {} B before it stored them", needle.len()));
+                }
+                state.waiting.push_back((*batch, needles));
+            }
+            Seen::Output(Output::Publish { bytes, .. } | Output::Answer { bytes, .. } | Output::Ask { bytes, .. }) => {
+                for (batch, needles) in &state.waiting {
+                    let leaked = |n: &&Vec<u8>| contains(bytes, n) && !state.durable.contains(&Hash::of(n));
+                    if let Some(needle) = needles.iter().find(leaked) {
+                        return Err(format!(
+                            "robot {robot}: sent a record of {} B while batch {batch} that holds it is not durable",
+                            needle.len()
+                        ));
+                    }
+                }
+                state.sent.push_back(bytes.clone());
+                if state.sent.len() > SENT_MAX {
+                    state.sent.pop_front();
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+fn sendable(record: &Record) -> Option<Vec<u8>> {
+    match record {
+        Record::Entry { bytes, .. } | Record::Blob { bytes, .. } => {
+            (bytes.len() >= RECORD_LEN_MIN).then(|| bytes.clone())
+        }
+        Record::Private { .. } => None,
+    }
+}
+
+fn contains(haystack: &[u8], needle: &[u8]) -> bool {
+    haystack.len() >= needle.len() && haystack.windows(needle.len()).any(|window| window == needle)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use merganser_protocol::agent::io::Channel;
+    use merganser_protocol::ids::Hash;
+
+    fn persist() -> Output {
+        let bytes: Vec<u8> = (0..40).collect();
+        Output::Persist { batch: 1, records: vec![Record::Blob { hash: Hash::of(&bytes), bytes }] }
+    }
+
+    fn publish() -> Output {
+        Output::Publish { channel: Channel::Facts, bytes: (0..=60).collect() }
+    }
+
+    #[test]
+    fn it_bites_on_a_message_that_is_too_early() {
+        let mut check = DurableFirst::default();
+        assert!(check.see(0, &Seen::Output(&persist())).is_ok());
+        assert!(check.see(1, &Seen::Output(&publish())).is_ok(), "another robot may hold it");
+        assert!(check.see(0, &Seen::Output(&publish())).is_err());
+    }
+
+    #[test]
+    fn it_bites_on_a_record_that_is_stored_after_it_was_sent() {
+        let mut check = DurableFirst::default();
+        assert!(check.see(0, &Seen::Output(&publish())).is_ok());
+        assert!(check.see(0, &Seen::Output(&persist())).is_err());
+    }
+
+    #[test]
+    fn it_is_content_once_the_disk_is() {
+        let mut check = DurableFirst::default();
+        assert!(check.see(0, &Seen::Output(&persist())).is_ok());
+        assert!(check.see(0, &Seen::Durable(1)).is_ok());
+        assert!(check.see(0, &Seen::Output(&publish())).is_ok());
+        assert!(check.see(0, &Seen::Output(&persist())).is_ok(), "stored once more");
+        assert!(check.see(0, &Seen::Output(&publish())).is_ok());
+        for seen in [Seen::Died, Seen::Wiped, Seen::Started] {
+            assert!(check.see(0, &seen).is_ok());
+        }
+        assert!(check.see(0, &Seen::Output(&persist())).is_ok());
+        assert!(check.see(0, &Seen::Output(&publish())).is_err(), "the new disk does not hold it");
+    }
+}

@@ -1,0 +1,202 @@
+//! The invariants, a file each (DESIGN §8). A check watches every output as it happens and samples of the whole swarm
+//! now and then; the first one that objects ends the run. Each file ends with a test that its check bites.
+
+mod contract;
+mod converged;
+mod durable_first;
+mod honest_covariance;
+mod merged_as_expected;
+mod no_false_merge;
+mod same_estimate;
+mod same_facts;
+mod sound_numbers;
+mod unique_entries;
+
+use crate::scenario::Expect;
+use merganser_protocol::agent::io::Output;
+use merganser_protocol::geometry::Se3;
+use merganser_protocol::ids::Hash;
+use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::time::Instant;
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// An invariant.
+pub trait Check {
+    /// Its name in reports.
+    fn name(&self) -> &'static str;
+
+    /// Something happened on a robot.
+    ///
+    /// # Errors
+    /// What is broken.
+    fn see(&mut self, _robot: usize, _seen: &Seen<'_>) -> Result<(), String> {
+        Ok(())
+    }
+
+    /// The whole swarm at one moment.
+    ///
+    /// # Errors
+    /// What is broken.
+    fn sample(&mut self, _sample: &Sample<'_>) -> Result<(), String> {
+        Ok(())
+    }
+}
+
+/// What a check can watch on one robot.
+#[derive(Clone, Copy, Debug)]
+pub enum Seen<'a> {
+    /// The process started.
+    Started,
+    /// A peer's question was put to it under this token.
+    Asked(u64),
+    /// It made an output.
+    Output(&'a Output),
+    /// Its disk made everything up to this batch durable.
+    Durable(u64),
+    /// The process died, and what was not durable with it.
+    Died,
+    /// Its disk was replaced by an empty one.
+    Wiped,
+}
+
+/// Where in the run a sample was taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Phase {
+    /// Robots drive, faults rage.
+    Storm,
+    /// The network has healed.
+    Calm,
+    /// The last sample.
+    End,
+}
+
+/// The swarm at one moment.
+#[derive(Clone, Debug)]
+pub struct Sample<'a> {
+    /// When.
+    pub phase: Phase,
+    /// Every robot that is running.
+    pub robots: Vec<RobotSample>,
+    /// `t_world_frame` of every frame, by `name/epoch`.
+    pub truth: &'a BTreeMap<String, Se3>,
+    /// What the scenario asks for.
+    pub expect: &'a Expect,
+}
+
+/// One running robot.
+#[derive(Clone, Debug)]
+pub struct RobotSample {
+    /// Its name.
+    pub name: String,
+    /// Digest of the facts it holds.
+    pub digest: Hash,
+    /// What it believes.
+    pub snapshot: Option<Snapshot>,
+}
+
+/// A broken invariant.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Violation {
+    /// Which.
+    pub invariant: String,
+    /// Virtual time, s.
+    pub at_secs: f64,
+    /// What is broken.
+    pub what: String,
+}
+
+/// All checks of a run.
+pub struct Checks(Vec<Box<dyn Check>>);
+
+impl Checks {
+    /// Every invariant there is.
+    pub fn all() -> Self {
+        Self(vec![
+            Box::<contract::Contract>::default(),
+            Box::<durable_first::DurableFirst>::default(),
+            Box::<unique_entries::UniqueEntries>::default(),
+            Box::new(same_facts::SameFacts),
+            Box::new(same_estimate::SameEstimate),
+            Box::new(sound_numbers::SoundNumbers),
+            Box::new(no_false_merge::NoFalseMerge),
+            Box::new(honest_covariance::HonestCovariance),
+            Box::new(converged::Converged),
+            Box::new(merged_as_expected::MergedAsExpected),
+        ])
+    }
+
+    /// Shows all checks what happened.
+    pub fn see(&mut self, now: Instant, robot: usize, seen: &Seen<'_>) -> Option<Violation> {
+        self.first(now, |check| check.see(robot, seen))
+    }
+
+    /// Shows all checks the swarm.
+    pub fn sample(&mut self, now: Instant, sample: &Sample<'_>) -> Option<Violation> {
+        self.first(now, |check| check.sample(sample))
+    }
+
+    fn first(&mut self, now: Instant, mut ask: impl FnMut(&mut dyn Check) -> Result<(), String>) -> Option<Violation> {
+        self.0.iter_mut().find_map(|check| {
+            let what = ask(check.as_mut()).err()?;
+            Some(Violation { invariant: check.name().to_owned(), at_secs: now.as_secs_f64(), what })
+        })
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative};
+    use merganser_protocol::snapshot::{
+        FrameView, FramesView, GraphView, MapView, PosesView, RelationView, StatsView, StatusView,
+    };
+
+    /// A relation with the same standard deviation in all six directions.
+    pub fn relation(pose: Se3, sigma: f64) -> RelationView {
+        let covariance = Covariance::from_sigmas([sigma; 6]).unwrap();
+        RelationView::from(&Relative::Metric(PoseWithCovariance { pose, covariance }))
+    }
+
+    /// A robot that believes these relations `t_own_frame`.
+    pub fn robot(name: &str, digest: u8, frames: &[(&str, RelationView)]) -> RobotSample {
+        let status = StatusView {
+            swarm: "test".into(),
+            robot: name.into(),
+            id: String::new(),
+            epoch: 1,
+            neighbours: Vec::new(),
+            entries: 3,
+            digest: digest.to_string(),
+            submaps: 1,
+            keyframes: 1,
+            pending: 0,
+            idle: true,
+            merged_with: frames.iter().filter_map(|(f, _)| f.split('/').next().map(str::to_owned)).collect(),
+            receive_only: false,
+        };
+        let frame = |(frame, t): &(&str, RelationView)| FrameView {
+            frame: (*frame).to_owned(),
+            robot: frame.split('/').next().unwrap_or_default().to_owned(),
+            submaps: 1,
+            component: 0,
+            t_own_frame: Some(t.clone()),
+        };
+        let frames =
+            FramesView { own: format!("{name}/1"), frames: frames.iter().map(frame).collect(), pairs: Vec::new() };
+        let snapshot = Snapshot {
+            status,
+            frames,
+            poses: PosesView { robots: Vec::new() },
+            map: MapView { submaps: Vec::new() },
+            graph: GraphView { nodes: 0, chi2: 0.0, dof: 0, edges: Vec::new() },
+            stats: StatsView::default(),
+        };
+        RobotSample { name: name.into(), digest: Hash([digest; 32]), snapshot: Some(snapshot) }
+    }
+
+    /// A last sample of these robots.
+    pub fn sample<'a>(robots: Vec<RobotSample>, truth: &'a BTreeMap<String, Se3>, expect: &'a Expect) -> Sample<'a> {
+        Sample { phase: Phase::End, robots, truth, expect }
+    }
+}

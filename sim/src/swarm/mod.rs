@@ -1,0 +1,482 @@
+//! The swarm: every robot's core, disk, SLAM and links in one queue of virtual time. Whatever a real shell does (deliver,
+//! persist, run jobs, time out, tell who is near) is an event here; jobs run inline and are charged virtual time.
+//! Robots' process clocks begin when their processes do, so an instant kept across a restart shows as a fault.
+
+mod act;
+#[cfg(test)]
+mod fake;
+mod robot;
+mod store;
+mod trace;
+
+pub use robot::Usage;
+
+use crate::check::{Checks, Phase, RobotSample, Sample, Seen, Violation};
+use crate::core::Core;
+use crate::dice::Dice;
+use crate::faults::{Fault, FaultCounts};
+use crate::network::{Network, millis};
+use crate::queue::Queue;
+use crate::scenario::Scenario;
+use crate::stage::{Stage, StageError};
+use merganser_protocol::agent::io::{Channel, Command, Event as Told, Input, JobId, QueryId, QueryKind};
+use merganser_protocol::agent::job::Job;
+use merganser_protocol::agent::{Restored, StartError};
+use merganser_protocol::geometry::Se3;
+use merganser_protocol::ids::{NameError, RobotId};
+use merganser_protocol::time::Instant;
+use robot::{Robot, Slam, identities};
+use std::collections::BTreeMap;
+use thiserror::Error;
+use trace::Trace;
+
+/// Outputs of one input at most, and events of one virtual second per robot at most: beyond, the core is in a loop.
+const OUTPUTS_MAX: usize = 100_000;
+const EVENTS_PER_SEC_AND_ROBOT_MAX: u64 = 50_000;
+/// Notable events kept for the report.
+const TOLD_MAX: usize = 10_000;
+/// Samples in a row that must find all done before the run ends early.
+const DONE_SAMPLES: u32 = 2;
+
+/// Why a swarm could not start.
+#[derive(Debug, Error)]
+pub enum SwarmError {
+    /// The world or the drives.
+    #[error(transparent)]
+    Stage(#[from] StageError),
+    /// A robot's name.
+    #[error(transparent)]
+    Name(#[from] NameError),
+    /// An agent.
+    #[error("robot {0} cannot start: {1}")]
+    Start(String, StartError),
+}
+
+/// A run in progress.
+pub struct Swarm<C> {
+    scenario: Scenario,
+    stage: Stage,
+    seed: u64,
+    queue: Queue<Event>,
+    network: Network,
+    robots: Vec<Robot<C>>,
+    ids: BTreeMap<RobotId, usize>,
+    checks: Checks,
+    trace: Trace,
+    counts: FaultCounts,
+    truth: BTreeMap<String, Se3>,
+    told: Vec<(f64, usize, Told)>,
+    violation: Option<Violation>,
+    healed: bool,
+    done_samples: u32,
+    events: u64,
+    /// The virtual second that events are being counted in, and how many it has had.
+    second: (u64, u64),
+}
+
+/// How a run ended.
+pub struct Outcome<C> {
+    /// What was run.
+    pub scenario: Scenario,
+    /// The world and the drives.
+    pub stage: Stage,
+    /// With which seed.
+    pub seed: u64,
+    /// The first broken invariant.
+    pub violation: Option<Violation>,
+    /// BLAKE3 over every input and output.
+    pub trace: merganser_protocol::ids::Hash,
+    /// Number of inputs and outputs.
+    pub trace_lines: u64,
+    /// Virtual time at the end.
+    pub ended: Instant,
+    /// Whether all held the same facts and had nothing left to do when it ended.
+    pub idle: bool,
+    /// Events handled.
+    pub events: u64,
+    /// Faults that fired.
+    pub counts: FaultCounts,
+    /// The robots at the end.
+    pub robots: Vec<RobotSample>,
+    /// Messages by kind, for each robot of the scenario.
+    pub usage: Vec<BTreeMap<&'static str, Usage>>,
+    /// `t_world_frame` of every frame.
+    pub truth: BTreeMap<String, Se3>,
+    /// What the agents told people: seconds, robot, event.
+    pub told: Vec<(f64, usize, Told)>,
+    _core: core::marker::PhantomData<C>,
+}
+
+/// All that can happen.
+enum Event {
+    Boot { robot: usize },
+    Keyframe { robot: usize, index: usize },
+    DriveEnds { robot: usize },
+    Broadcast { from: usize, to: usize, channel: Channel, bytes: Vec<u8> },
+    Ask { from: usize, from_incarnation: u32, to: usize, query: QueryId, kind: QueryKind, bytes: Vec<u8> },
+    Answer { to: usize, incarnation: u32, query: QueryId, bytes: Option<Vec<u8>> },
+    Durable { robot: usize, incarnation: u32, batch: u64 },
+    DiskRefuses { robot: usize, incarnation: u32, batch: u64 },
+    JobDone { robot: usize, incarnation: u32, id: JobId, job: Box<Job> },
+    Wake { robot: usize, incarnation: u32, at: Instant },
+    Hear { observer: usize, subject: usize, version: u64 },
+    FaultBegins(usize),
+    FaultEnds(usize),
+    Heal,
+    Sample,
+}
+
+impl<C: Core> Swarm<C> {
+    /// A swarm at time zero.
+    ///
+    /// # Errors
+    /// [`SwarmError`] if the scenario cannot be staged.
+    pub fn new(scenario: Scenario, seed: u64) -> Result<Self, SwarmError> {
+        let stage = Stage::new(&scenario, seed)?;
+        let mut dice = Dice::new(seed, "machines");
+        let mut queue = Queue::new();
+        let mut robots = Vec::new();
+        for (index, (identity, id)) in identities(&stage, seed)?.into_iter().enumerate() {
+            let offset = scenario.machine.clock_offset_secs;
+            let slam = Slam::new(dice.range(-offset, offset));
+            let starts = millis(1e3 * dice.range(0.0, scenario.machine.start_within_secs));
+            robots.push(Robot::new(identity, id, slam, &scenario));
+            queue.push(Instant::ZERO.after(starts), Event::Boot { robot: index });
+            let steps = stage.steps(index);
+            for (k, step) in steps.iter().enumerate() {
+                let at = Instant::from_nanos(step.nanos).after(starts);
+                queue.push(at, Event::Keyframe { robot: index, index: k });
+                if k + 1 == steps.len() {
+                    queue.push(at, Event::DriveEnds { robot: index });
+                }
+            }
+        }
+        for (index, fault) in scenario.faults.iter().enumerate() {
+            queue.push(secs(fault.begins()), Event::FaultBegins(index));
+            if let Some(ends) = fault.ends() {
+                queue.push(secs(ends), Event::FaultEnds(index));
+            }
+        }
+        queue.push(secs(scenario.duration_secs + scenario.machine.start_within_secs), Event::Heal);
+        queue.push(secs(1.0), Event::Sample);
+        Ok(Self {
+            network: Network::new(scenario.network.clone(), scenario.robots, seed),
+            ids: robots.iter().enumerate().map(|(index, robot)| (robot.id, index)).collect(),
+            scenario,
+            stage,
+            seed,
+            queue,
+            robots,
+            checks: Checks::all(),
+            trace: Trace::default(),
+            counts: FaultCounts::default(),
+            truth: BTreeMap::new(),
+            told: Vec::new(),
+            violation: None,
+            healed: false,
+            done_samples: 0,
+            events: 0,
+            second: (0, 0),
+        })
+    }
+
+    /// Runs to the end: until an invariant breaks, all is calm and done, or the time to settle is over. `progress` is
+    /// told the virtual time now and then.
+    ///
+    /// # Errors
+    /// [`SwarmError::Start`] if an agent refuses to start.
+    pub fn run(mut self, mut progress: impl FnMut(Instant)) -> Result<Outcome<C>, SwarmError> {
+        let storm = self.scenario.duration_secs + self.scenario.machine.start_within_secs;
+        let end = secs(storm + self.scenario.settle_secs);
+        let mut ended = end;
+        while let Some((now, event)) = self.queue.pop() {
+            if now > end {
+                break;
+            }
+            self.guard(now);
+            let sampled = matches!(event, Event::Sample);
+            self.step(now, event)?;
+            if sampled {
+                progress(now);
+            }
+            if self.violation.is_some() || self.done_samples >= DONE_SAMPLES {
+                ended = now;
+                break;
+            }
+        }
+        Ok(self.finish(ended))
+    }
+
+    /// The longest this run can take, virtual.
+    pub fn end(&self) -> Instant {
+        secs(self.scenario.duration_secs + self.scenario.machine.start_within_secs + self.scenario.settle_secs)
+    }
+
+    fn finish(mut self, ended: Instant) -> Outcome<C> {
+        let robots = self.robot_samples(ended);
+        if self.violation.is_none() {
+            let sample =
+                Sample { phase: Phase::End, robots: robots.clone(), truth: &self.truth, expect: &self.scenario.expect };
+            self.violation = self.checks.sample(ended, &sample);
+        }
+        Outcome {
+            violation: self.violation,
+            trace: self.trace.hash(),
+            trace_lines: self.trace.lines(),
+            ended,
+            idle: all_done(&robots),
+            events: self.events,
+            counts: self.counts,
+            robots,
+            usage: self.robots.into_iter().map(|robot| robot.usage).collect(),
+            truth: self.truth,
+            told: self.told,
+            scenario: self.scenario,
+            stage: self.stage,
+            seed: self.seed,
+            _core: core::marker::PhantomData,
+        }
+    }
+
+    /// A core that never rests would keep virtual time from moving on.
+    fn guard(&mut self, now: Instant) {
+        self.events += 1;
+        let second = now.as_nanos() / 1_000_000_000;
+        self.second = if second == self.second.0 { (second, self.second.1 + 1) } else { (second, 1) };
+        if self.second.1 > EVENTS_PER_SEC_AND_ROBOT_MAX * self.scenario.robots as u64 {
+            self.object("no endless loop", format!("{} events within one virtual second", self.second.1));
+        }
+    }
+
+    fn object(&mut self, invariant: &str, what: String) {
+        let at_secs = self.queue.now().as_secs_f64();
+        self.violation.get_or_insert(Violation { invariant: invariant.to_owned(), at_secs, what });
+    }
+
+    fn step(&mut self, now: Instant, event: Event) -> Result<(), SwarmError> {
+        // What is meant for a paused process waits, in order.
+        if let Some(robot) = event.process()
+            && now < self.robots[robot].paused_until
+        {
+            self.counts.delayed_by_pause += 1;
+            self.queue.push(self.robots[robot].paused_until, event);
+            return Ok(());
+        }
+        match event {
+            Event::Boot { robot } => self.boot(now, robot)?,
+            Event::FaultBegins(index) => self.fault_begins(now, index),
+            Event::FaultEnds(index) => self.fault_ends(now, index)?,
+            Event::Heal => self.heal(now)?,
+            Event::Sample => self.sample(now),
+            other => self.deliver(now, other),
+        }
+        Ok(())
+    }
+
+    fn boot(&mut self, now: Instant, index: usize) -> Result<(), SwarmError> {
+        let robot = &mut self.robots[index];
+        if robot.core.is_some() || robot.gone {
+            return Ok(());
+        }
+        robot.incarnation += 1;
+        robot.booted = now;
+        let restored = Restored { records: robot.store.records(), fresh_epoch: robot.incarnation };
+        let seed = Dice::new(self.seed, &format!("agent {index} {}", robot.incarnation)).bits();
+        let core = C::start(self.scenario.config.clone(), robot.identity.clone(), seed, restored, robot.local(now))
+            .map_err(|error| SwarmError::Start(robot.name.to_string(), error))?;
+        robot.core = Some(core);
+        self.trace.note(now, index, "boot");
+        self.see(index, &Seen::Started);
+        self.counts.restarted += u64::from(self.robots[index].incarnation > 1);
+        self.drain(now, index);
+        self.update_hearing(now);
+        Ok(())
+    }
+
+    fn kill(&mut self, now: Instant, index: usize) {
+        let robot = &mut self.robots[index];
+        if robot.core.is_none() {
+            return;
+        }
+        robot.forget(now);
+        self.counts.records_lost += robot.store.crash() as u64;
+        self.counts.killed += 1;
+        self.trace.note(now, index, "kill");
+        self.see(index, &Seen::Died);
+        self.update_hearing(now);
+    }
+
+    fn fault_begins(&mut self, now: Instant, index: usize) {
+        let fault = self.scenario.faults[index].clone();
+        match &fault {
+            Fault::Partition { .. } | Fault::Isolate { .. } | Fault::OneWay { .. } => self.block(now, &fault, true),
+            Fault::Kill { robot, .. } => self.with(robot, |swarm, robot| swarm.kill(now, robot)),
+            Fault::Wipe { robot, .. } => self.with(robot, |swarm, robot| {
+                swarm.kill(now, robot);
+                swarm.robots[robot].store.wipe();
+                swarm.counts.wiped += 1;
+                swarm.see(robot, &Seen::Wiped);
+            }),
+            Fault::Pause { robot, lasts, .. } => self.with(robot, |swarm, robot| {
+                swarm.robots[robot].paused_until = now.after(millis(1e3 * lasts));
+                swarm.counts.paused += 1;
+                swarm.update_hearing(now);
+            }),
+            Fault::NewFrame { robot, .. } => self.with(robot, |swarm, robot| {
+                swarm.robots[robot].slam.restart();
+                swarm.counts.new_frames += 1;
+                swarm.feed(now, robot, Input::Command(Command::NewEpoch));
+            }),
+            Fault::DiskFull { robot, .. } => self.with(robot, |swarm, robot| swarm.robots[robot].disk_full = true),
+            Fault::Leave { robot, .. } => self.with(robot, |swarm, robot| {
+                swarm.kill(now, robot);
+                swarm.robots[robot].gone = true;
+                swarm.counts.left += 1;
+            }),
+        }
+    }
+
+    fn fault_ends(&mut self, now: Instant, index: usize) -> Result<(), SwarmError> {
+        let fault = self.scenario.faults[index].clone();
+        match &fault {
+            // The healing may have come first.
+            Fault::Partition { .. } | Fault::Isolate { .. } | Fault::OneWay { .. } if !self.healed => {
+                self.block(now, &fault, false);
+            }
+            Fault::Kill { robot, .. } | Fault::Wipe { robot, .. } => {
+                if let Some(robot) = self.find(robot) {
+                    self.robots[robot].disk_full = false;
+                    self.boot(now, robot)?;
+                }
+            }
+            Fault::Pause { .. } => self.update_hearing(now),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// All faults stop. A robot whose disk was full gets room, and a restart.
+    fn heal(&mut self, now: Instant) -> Result<(), SwarmError> {
+        self.healed = true;
+        self.network.heal();
+        for robot in 0..self.robots.len() {
+            if core::mem::take(&mut self.robots[robot].disk_full) {
+                self.kill(now, robot);
+            }
+            self.boot(now, robot)?;
+        }
+        self.update_hearing(now);
+        Ok(())
+    }
+
+    fn block(&mut self, now: Instant, fault: &Fault, blocked: bool) {
+        let n = self.robots.len();
+        for from in 0..n {
+            for to in 0..n {
+                if from != to && severs(fault, self.robots[from].name.as_str(), self.robots[to].name.as_str()) {
+                    self.network.block(from, to, blocked);
+                }
+            }
+        }
+        self.update_hearing(now);
+    }
+
+    /// Notices who can hear whom, and plans to tell those for whom it changed.
+    fn update_hearing(&mut self, now: Instant) {
+        let options = self.network.options().clone();
+        let alive: Vec<bool> = self.robots.iter().map(|r| r.core.is_some() && now >= r.paused_until).collect();
+        for observer in 0..alive.len() {
+            for (subject, &subject_alive) in alive.iter().enumerate() {
+                let running = self.robots[observer].core.is_some();
+                let so = running && subject_alive && self.network.is_open(subject, observer);
+                let hearing = &mut self.robots[observer].hears[subject];
+                if hearing.so == so {
+                    continue;
+                }
+                hearing.so = so;
+                hearing.version += 1;
+                let delay = millis(if so { options.discover_ms } else { options.lease_ms });
+                self.queue.push(now.after(delay), Event::Hear { observer, subject, version: hearing.version });
+            }
+        }
+    }
+
+    fn sample(&mut self, now: Instant) {
+        let robots = self.robot_samples(now);
+        let done = self.healed && all_done(&robots);
+        self.done_samples = if done { self.done_samples + 1 } else { 0 };
+        let phase = if self.healed { Phase::Calm } else { Phase::Storm };
+        let sample = Sample { phase, robots, truth: &self.truth, expect: &self.scenario.expect };
+        if let Some(violation) = self.checks.sample(now, &sample) {
+            self.violation.get_or_insert(violation);
+        }
+        self.queue.push(now.after(millis(1000.0)), Event::Sample);
+    }
+
+    fn robot_samples(&self, now: Instant) -> Vec<RobotSample> {
+        let sample = |robot: &Robot<C>| {
+            let local = robot.local(now);
+            let core = robot.core.as_ref()?;
+            Some(RobotSample { name: robot.name.to_string(), digest: core.digest(), snapshot: core.snapshot(local) })
+        };
+        self.robots.iter().filter_map(sample).collect()
+    }
+
+    fn see(&mut self, robot: usize, seen: &Seen<'_>) {
+        if let Some(violation) = self.checks.see(self.queue.now(), robot, seen) {
+            self.violation.get_or_insert(violation);
+        }
+    }
+
+    fn find(&self, name: &str) -> Option<usize> {
+        self.robots.iter().position(|robot| robot.name.as_str() == name)
+    }
+
+    fn with(&mut self, name: &str, act: impl FnOnce(&mut Self, usize)) {
+        if let Some(robot) = self.find(name) {
+            act(self, robot);
+        }
+    }
+}
+
+impl Event {
+    /// The process that must run for this to happen; `None` for what concerns the outside.
+    fn process(&self) -> Option<usize> {
+        match *self {
+            Self::Keyframe { robot, .. }
+            | Self::DriveEnds { robot }
+            | Self::Durable { robot, .. }
+            | Self::DiskRefuses { robot, .. }
+            | Self::JobDone { robot, .. }
+            | Self::Wake { robot, .. } => Some(robot),
+            Self::Broadcast { to, .. } | Self::Ask { to, .. } | Self::Answer { to, .. } => Some(to),
+            Self::Hear { observer, .. } => Some(observer),
+            Self::Boot { .. } | Self::FaultBegins(_) | Self::FaultEnds(_) | Self::Heal | Self::Sample => None,
+        }
+    }
+}
+
+fn severs(fault: &Fault, from: &str, to: &str) -> bool {
+    match fault {
+        Fault::Partition { groups, .. } => {
+            let group = |name: &str| groups.iter().position(|group| group.iter().any(|member| member == name));
+            // Those in no group are cut off from one another as well.
+            group(from).is_none() || group(from) != group(to)
+        }
+        Fault::Isolate { robot, .. } => robot == from || robot == to,
+        Fault::OneWay { from: one, to: other, .. } => one == from && other == to,
+        _ => false,
+    }
+}
+
+fn all_done(robots: &[RobotSample]) -> bool {
+    let same = robots.windows(2).all(|pair| pair[0].digest == pair[1].digest);
+    same && robots.iter().all(|robot| robot.snapshot.as_ref().is_none_or(|s| s.status.idle))
+}
+
+fn secs(secs: f64) -> Instant {
+    Instant::ZERO.after(millis(1e3 * secs))
+}
+
+#[cfg(test)]
+mod tests;
