@@ -189,7 +189,7 @@ impl Drops {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use merganser_protocol::agent::io::{Channel, Command, JobId, QueryId};
+    use merganser_protocol::agent::io::{Channel, Command, QueryId};
     use merganser_protocol::ids::RobotId;
 
     fn robot(name: &str) -> Source {
@@ -245,7 +245,6 @@ mod tests {
             assert!(matches!(outbox.next().await, Some(Input::Answered { query: QueryId(n), .. }) if n == number));
         }
         assert!(matches!(outbox.next().await, Some(Input::Received { .. })));
-        let _ = JobId(0);
     }
 
     #[tokio::test]
