@@ -56,8 +56,8 @@ impl Default for RefineConfig {
             patch_voxels: 8.0,
             floor_voxels: 0.1,
             floor_rim_voxels: 0.1,
-            feigned: 0.004,
-            share_min: 0.006,
+            feigned: 0.2,
+            share_min: 0.004,
         }
     }
 }
@@ -250,13 +250,18 @@ impl System {
 
     fn covariance(&self, voxel: f64, config: &RefineConfig) -> Result<Covariance<6>, RefineError> {
         let weight: f64 = self.rows.iter().map(|r| r.weight).sum();
-        let eigen = (self.information / weight).symmetric_eigen();
-        let share = eigen.eigenvalues.min() - config.feigned;
+        let eigen = self.information.symmetric_eigen();
+        let shares = Vector6::from_fn(|k, _| {
+            let along = self.rows.iter().map(|r| (r.jacobian.dot(&eigen.eigenvectors.column(k)), r.weight));
+            along.filter(|(j, _)| j.abs() > config.feigned).map(|(j, w)| w * j * j).sum::<f64>() / weight
+        });
+        let share = shares.min();
+        if std::env::var_os("EIG").is_some() { println!("eig {:?} {:?}", (eigen.eigenvalues/weight).as_slice(), shares.as_slice()); }
         let degenerate = RefineError::Degenerate { share };
         if share < config.share_min {
             return Err(degenerate);
         }
-        let inverse_values = eigen.eigenvalues.map(|value| 1.0 / ((value - config.feigned) * weight));
+        let inverse_values = shares.map(|share| 1.0 / (share * weight));
         let inverse = eigen.eigenvectors * Matrix6::from_diagonal(&inverse_values) * eigen.eigenvectors.transpose();
         let mut scores: BTreeMap<[i32; 3], Vector6<f64>> = BTreeMap::new();
         for row in &self.rows {

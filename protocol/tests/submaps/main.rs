@@ -27,7 +27,7 @@ fn report(set: &Set) {
     println!("{}: points {:?}", set.name, set.places.iter().map(|p| p.described.features.len()).collect::<Vec<_>>());
     println!("describe ms {:?}", set.places.iter().map(|p| p.describe_time.as_millis()).collect::<Vec<_>>());
     let v = set.config.voxel_m;
-    for count in [64, 128, 256, 268, 512] {
+    for count in [128, 256, 384] {
         let (mut ok, mut total, mut ratio, mut pairs, mut time) = (0, 0, 0.0, 0, 0.0);
         for (ia, a) in set.places.iter().enumerate() {
             let keypoints = a.described.keypoints.first(count);
@@ -128,4 +128,22 @@ fn seven() {
 fn kitti() {
     let Some(data) = data::shared() else { return };
     report(&data::kitti07(&data));
+}
+
+#[test]
+fn select() {
+    let Some(data) = data::shared() else { return };
+    report(&data::seven_scenes(&data));
+    report(&data::kitti07(&data));
+    report(&world::World::hall(1).set("hall", 6, [5.0, 3.0], 0.005, 2));
+    report(&world::World::hall(5).set("hall5", 6, [5.0, 3.0], 0.005, 2));
+}
+
+#[test]
+fn corridor() {
+    let set = world::World::corridor().set("corridor", 4, [1.0, 0.5], 0.002, 3);
+    for a in &set.places { for b in &set.places {
+        let truth = b.t_world_anchor.inverse() * a.t_world_anchor;
+        println!("{:?}", refine(&a.described.keypoints, &b.described.features, &truth, &RefineConfig::default()).map(|r| (r.pose.covariance.sigmas().transpose(), r.pose.pose.local(&truth).transpose())));
+    }}
 }

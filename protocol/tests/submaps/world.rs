@@ -15,6 +15,7 @@ pub struct World {
 }
 
 const RANGE_MAX: f64 = 12.0;
+const VOXEL: f64 = 0.15;
 
 impl World {
     /// A furnished hall of 14 × 9 × 3 m.
@@ -113,8 +114,8 @@ impl World {
     /// Several submaps of this world.
     pub fn set(&self, name: &'static str, count: usize, spread: [f64; 2], drift: f64, seed: u64) -> Set {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let places = (0..count).map(|_| self.drive(spread, 0.02, drift, 0.1, &mut rng)).collect();
-        Set { name, config: config(0.1, 5), places, rotation_deg_max: 5.0, translation_max: 0.4 }
+        let places = (0..count).map(|_| self.drive(spread, 0.02, drift, VOXEL, &mut rng)).collect();
+        Set { name, config: config(VOXEL, 5), places, rotation_deg_max: 5.0, translation_max: 0.4 }
     }
 }
 
