@@ -1,0 +1,212 @@
+//! The whole estimator: search from tight to loose, accept by false alarms, look for a rival, refine, state the
+//! uncertainty.
+
+use super::accept::{self, COUNT_MIN, Significance};
+use super::covariance::{self, Estimate};
+use super::prepare::{self, Matches};
+use super::refine::{self, Context, Fit};
+use super::sample::{Candidate, Sampler, Step};
+use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig, Standing};
+
+/// Size of the first prefix of matches searched; each next is four times as large.
+const PREFIX_FIRST: usize = 128;
+/// σ levels: σ_max over 1, 2, 4, 8, 16.
+const LEVELS: u32 = 5;
+/// Relative cost of a level, or doubt that it is the right one: σ_max is commonly 3–10 × the truth, and the tighter
+/// graph is the cheaper.
+const LEVEL_COSTS: [usize; LEVELS as usize] = [20, 10, 4, 4, 8];
+/// Candidates evaluated on all matches, per step.
+const EVALUATED: usize = 3;
+/// Matches of a rival expected in the prefix in which it is sought.
+const RIVAL_EXPECTED: f64 = 20.0;
+/// An inlier lies within so many σ̂: the 99 % quantile of χ₃, and a margin.
+const INLIER_REACH: f64 = 4.0;
+
+/// Finds the motion that maps source to target.
+///
+/// Same matches in any order and same `config` give the same result, to the bit.
+///
+/// # Errors
+/// [`AlignError`] if the call is malformed; that there is no alignment is not an error but a [`Refusal`].
+pub fn align(problem: &Problem, config: &SolverConfig) -> Result<Result<Alignment, Refusal>, AlignError> {
+    let matches = prepare::prepare(problem, config)?;
+    Ok(Search::new(&matches, config).run())
+}
+
+/// A fit that was evaluated on all matches.
+struct Evaluated {
+    fit: Fit,
+    significance: Significance,
+    /// Σ of inlier probabilities over matches that count.
+    support: f64,
+}
+
+struct Search<'a> {
+    context: Context<'a>,
+    config: &'a SolverConfig,
+    sampler: Sampler,
+    candidates: Vec<Candidate>,
+    refine: refine::Scratch,
+    accept: accept::Scratch,
+    /// Best that was not accepted.
+    refused: Significance,
+    refused_support: f64,
+    /// Smallest rotation uncertainty among significant but degenerate fits.
+    degenerate: Option<f64>,
+}
+
+/// Where the search stands: a prefix of the pool and a σ level.
+#[derive(Clone, Copy)]
+struct Stage {
+    prefix: usize,
+    level: u32,
+}
+
+impl<'a> Search<'a> {
+    fn new(matches: &'a Matches, config: &'a SolverConfig) -> Self {
+        let (with_scale, scale_range) = match config.model {
+            Model::Rigid => (false, (1.0, 1.0)),
+            Model::Similarity { scale_min, scale_max } => (true, (scale_min, scale_max)),
+        };
+        let sigma_max = config.sigma_max;
+        let volume = matches.volume(4.0 * sigma_max);
+        Self {
+            context: Context { matches, with_scale, scale_range, sigma_max, volume },
+            config,
+            sampler: Sampler::default(),
+            candidates: Vec::new(),
+            refine: refine::Scratch::default(),
+            accept: accept::Scratch::default(),
+            refused: Significance { log10_nfa: f64::INFINITY, count: 0 },
+            refused_support: 0.0,
+            degenerate: None,
+        }
+    }
+
+    fn run(mut self) -> Result<Alignment, Refusal> {
+        let needed = (self.config.support_min.ceil() as usize).max(COUNT_MIN);
+        if self.context.matches.inliers_max < needed {
+            return Err(Refusal::TooFew { distinct: self.context.matches.inliers_max, needed });
+        }
+        let pool: Vec<u32> = (0..self.context.matches.len() as u32).collect();
+        let Some((mut best, stage)) = self.first_accepted(&pool) else {
+            return Err(match self.degenerate {
+                Some(rotation_sigma) => Refusal::Degenerate { rotation_sigma },
+                None => Refusal::NoConsensus { log10_nfa: self.refused.log10_nfa, support: self.refused_support },
+            });
+        };
+        if let Some(rival) = self.rival(&best, stage) {
+            let (a, b) = (best.support, rival.support);
+            if a.min(b) >= self.config.rival_ratio * a.max(b) {
+                return Err(Refusal::Ambiguous { support: a.max(b), rival_support: a.min(b) });
+            }
+            if b > a {
+                best = rival;
+            }
+        }
+        self.conclude(best)
+    }
+
+    /// Searches growing prefixes and σ levels until a fit is accepted; else the best provisional one of all.
+    fn first_accepted(&mut self, pool: &[u32]) -> Option<(Evaluated, Stage)> {
+        let bar = self.config.log10_nfa_provisional.unwrap_or(self.config.log10_nfa_max);
+        let mut best: Option<(Evaluated, Stage)> = None;
+        for stage in stages(pool.len()) {
+            let Some(found) = self.step(pool, stage, bar, None) else { continue };
+            let nfa = found.significance.log10_nfa;
+            if best.as_ref().is_none_or(|(b, _)| nfa < b.significance.log10_nfa) {
+                best = Some((found, stage));
+            }
+            if nfa <= self.config.log10_nfa_max {
+                return best;
+            }
+        }
+        best
+    }
+
+    /// One prefix at one σ level: the best fit with log₁₀ NFA up to `bar`. Matches in `taken` do not count.
+    fn step(&mut self, pool: &[u32], stage: Stage, bar: f64, taken: Option<&[bool]>) -> Option<Evaluated> {
+        let sigma = self.config.sigma_max / f64::from(1_u32 << stage.level);
+        let prefix = &pool[..stage.prefix.min(pool.len())];
+        let step = Step { sigma, hypotheses_max: self.config.hypotheses_max };
+        let mut candidates = core::mem::take(&mut self.candidates);
+        self.sampler.propose(&self.context, prefix, &step, &mut candidates);
+        let mut best: Option<Evaluated> = None;
+        for candidate in candidates.iter().take(EVALUATED) {
+            let Some(found) = self.evaluate(candidate, bar, taken) else { continue };
+            if best.as_ref().is_none_or(|b| found.significance.log10_nfa < b.significance.log10_nfa) {
+                best = Some(found);
+            }
+        }
+        self.candidates = candidates;
+        best
+    }
+
+    /// Refines a candidate on all matches; `None` unless it is significant, supported and well determined.
+    fn evaluate(&mut self, candidate: &Candidate, bar: f64, taken: Option<&[bool]>) -> Option<Evaluated> {
+        let fit = refine::em(&self.context, candidate.motion, &mut self.refine)?;
+        let significance = accept::significance(&self.context, &fit, taken, &mut self.accept);
+        if significance.log10_nfa > bar || (significance.count as f64) < self.config.support_min {
+            if significance.log10_nfa < self.refused.log10_nfa && taken.is_none() {
+                self.refused = significance;
+                self.refused_support = fit.support();
+            }
+            return None;
+        }
+        let rotation_sigma = covariance::estimate(&self.context, &fit).map_or(f64::INFINITY, |e| e.rotation_sigma);
+        if rotation_sigma > self.config.rotation_sigma_max {
+            self.degenerate = Some(self.degenerate.map_or(rotation_sigma, |d| d.min(rotation_sigma)));
+            return None;
+        }
+        let counts = |i: usize| taken.is_none_or(|t| !t[i]);
+        let support = (0..fit.probabilities.len()).filter(|&i| counts(i)).map(|i| fit.probabilities[i]).sum();
+        Some(Evaluated { fit, significance, support })
+    }
+
+    /// The best significant fit that shares no match with `best`: sought on a prefix in which a rival of weight has
+    /// [`RIVAL_EXPECTED`] matches, at the σ level that found `best` and the next looser one.
+    fn rival(&mut self, best: &Evaluated, stage: Stage) -> Option<Evaluated> {
+        let reach = INLIER_REACH * best.fit.sigma;
+        let taken: Vec<bool> = best.fit.squared.iter().map(|r2| *r2 < reach * reach).collect();
+        let pool: Vec<u32> = (0..taken.len() as u32).filter(|&i| !taken[i as usize]).collect();
+        let weight = self.config.rival_ratio * best.support;
+        if (pool.len() as f64) < weight || pool.len() < COUNT_MIN {
+            return None;
+        }
+        let prefix = ((RIVAL_EXPECTED / weight * pool.len() as f64) as usize).max(stage.prefix);
+        let bar = best.significance.log10_nfa.max(self.config.log10_nfa_max);
+        let looser = stage.level.saturating_sub(1);
+        (looser..=stage.level).rev().find_map(|level| self.step(&pool, Stage { prefix, level }, bar, Some(&taken)))
+    }
+
+    fn conclude(&mut self, best: Evaluated) -> Result<Alignment, Refusal> {
+        let fit = refine::reweight(&self.context, best.fit, self.config.weighting, &mut self.refine);
+        let Some(Estimate { relative, eigenvalues, .. }) = covariance::estimate(&self.context, &fit) else {
+            return Err(Refusal::Degenerate { rotation_sigma: f64::INFINITY });
+        };
+        let matches = self.context.matches;
+        Ok(Alignment {
+            t_target_source: relative,
+            standing: match best.significance.log10_nfa <= self.config.log10_nfa_max {
+                true => Standing::Accepted,
+                false => Standing::Provisional,
+            },
+            sigma: fit.sigma * fit.motion.residual_unit(),
+            inlier_probabilities: matches.distinct_of_input.iter().map(|&k| fit.probabilities[k as usize]).collect(),
+            support: fit.support(),
+            log10_nfa: best.significance.log10_nfa,
+            weighting: fit.weighting,
+            information_eigenvalues: eigenvalues,
+        })
+    }
+}
+
+/// Prefixes 128, 512, … and all, each at every σ level, cheapest and likeliest first.
+fn stages(n: usize) -> Vec<Stage> {
+    let growing = core::iter::successors(Some(PREFIX_FIRST), |p| p.checked_mul(4));
+    let prefixes = growing.take_while(|p| p * 3 / 2 < n).chain([n]);
+    let mut stages: Vec<Stage> =
+        prefixes.flat_map(|prefix| (0..LEVELS).map(move |level| Stage { prefix, level })).collect();
+    stages.sort_by_key(|s| s.prefix * LEVEL_COSTS[s.level as usize]);
+    stages
+}

@@ -1,0 +1,140 @@
+//! What an alignment is worth: the covariance of its local perturbation and the geometry's eigenvalues.
+//!
+//! A local perturbation moves `s R p + t` by `J δ`, J = s R [I, −p^, p] (the last column for SIM(3) only). At the inliers'
+//! centroid the information Σ w JᵀJ / σ̂² falls apart into translation, rotation and scale; the result is carried to the
+//! source origin by Ad. w = p (1 − (1 − p) r² / 3σ²) is the expected curvature of the mixture's log-likelihood: matches
+//! of doubtful membership inform less. The covariance is inflated so that its χ² ellipsoid covers 95 % although σ̂ is
+//! estimated from ν = 3 Σp − dof residuals.
+
+use super::refine::{Context, Fit};
+use crate::geometry::so3::hat;
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
+use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
+
+/// An alignment with its uncertainty.
+#[derive(Clone, Debug)]
+pub(super) struct Estimate {
+    pub relative: Relative,
+    /// Ascending.
+    pub eigenvalues: Vec<f64>,
+    /// Largest standard deviation of a rotation axis, rad.
+    pub rotation_sigma: f64,
+}
+
+/// The information at the inliers' centroid.
+struct Information {
+    /// Centroid in centred source coordinates.
+    centroid: Vector3<f64>,
+    /// Of each translation axis.
+    translation: f64,
+    /// Of rotation.
+    rotation: Matrix3<f64>,
+    /// Of log-scale.
+    scale: f64,
+}
+
+/// The estimate of a fit; `None` where a rotation or the scale is wholly undetermined.
+pub(super) fn estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
+    let information = information(context, fit);
+    let axes = information.rotation.symmetric_eigen();
+    let weakest = axes.eigenvalues.min();
+    let determined = weakest > 1e-12 * axes.eigenvalues.max();
+    if !determined {
+        return None;
+    }
+    let inflation = inflation(3.0 * fit.support() - context.dof(), context.with_scale);
+    let rotation = Matrix3::from_diagonal(&axes.eigenvalues.map(|l| inflation / l));
+    let rotation = axes.eigenvectors * rotation * axes.eigenvectors.transpose();
+    let translation = inflation / information.translation;
+    let mut eigenvalues: Vec<f64> = vec![information.translation; 3];
+    eigenvalues.extend(axes.eigenvalues.iter());
+    if context.with_scale {
+        eigenvalues.push(information.scale);
+    }
+    eigenvalues.sort_unstable_by(f64::total_cmp);
+    let motion = &fit.motion;
+    // x ↦ target_centre + motion(x − source_centre)
+    let turned = motion.rotation * context.matches.source_centre * motion.scale;
+    let moved = context.matches.target_centre + motion.translation - turned;
+    let centre = context.matches.source_centre + information.centroid;
+    let so3 = So3::from_matrix(&motion.rotation);
+    let relative = if context.with_scale {
+        let scale = inflation / information.scale;
+        let sim = Sim3::new(so3, moved, motion.scale);
+        Relative::Similarity(SimWithCovariance {
+            sim,
+            covariance: carried_sim(translation, &rotation, scale, &centre)?,
+        })
+    } else {
+        let pose = Se3::new(so3, moved);
+        Relative::Metric(PoseWithCovariance { pose, covariance: carried_pose(translation, &rotation, &centre)? })
+    };
+    Some(Estimate { relative, eigenvalues, rotation_sigma: (inflation / weakest).sqrt() })
+}
+
+fn information(context: &Context, fit: &Fit) -> Information {
+    let unit = fit.motion.residual_unit();
+    let variance = fit.sigma * fit.sigma;
+    let weight = |i: usize| {
+        let p = fit.probabilities[i];
+        p * (1.0 - (1.0 - p) * fit.squared[i] / (3.0 * variance))
+    };
+    let inliers = || (0..fit.probabilities.len()).filter(|&i| fit.probabilities[i] > 0.0);
+    let total: f64 = inliers().map(weight).sum();
+    // Curvature may turn negative in hopeless mixtures; then fall back to the plain posteriors, and say as little.
+    let plain: f64 = fit.support();
+    let curved = total > 0.5 * plain;
+    let weight = |i: usize| if curved { weight(i) } else { 0.5 * fit.probabilities[i] };
+    let total = if curved { total } else { 0.5 * plain };
+    let source = &context.matches.source;
+    let centroid = inliers().map(|i| source[i] * weight(i)).sum::<Vector3<f64>>() / total;
+    let (mut scatter, mut spread) = (Matrix3::zeros(), 0.0);
+    for i in inliers() {
+        let x = source[i] - centroid;
+        scatter += x * x.transpose() * weight(i);
+        spread += x.norm_squared() * weight(i);
+    }
+    let k = motion_gain(fit.motion.scale, unit, variance);
+    let rotation = (Matrix3::identity() * spread - scatter) * k;
+    Information { centroid, translation: total * k, rotation, scale: spread * k }
+}
+
+/// s² / σ² with σ in target units.
+fn motion_gain(scale: f64, unit: f64, variance: f64) -> f64 {
+    scale * scale / (variance * unit * unit)
+}
+
+/// Ad of a translation by `c` maps the perturbation about c to the one about the origin: ρ₀ = ρ + c × φ (− c λ).
+fn carried_pose(translation: f64, rotation: &Matrix3<f64>, c: &Vector3<f64>) -> Option<Covariance<6>> {
+    let mut local = Matrix6::zeros();
+    local.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(translation);
+    local.fixed_view_mut::<3, 3>(3, 3).copy_from(rotation);
+    let mut ad = Matrix6::identity();
+    ad.fixed_view_mut::<3, 3>(0, 3).copy_from(&hat(c));
+    representable(ad * local * ad.transpose())
+}
+
+fn carried_sim(translation: f64, rotation: &Matrix3<f64>, scale: f64, c: &Vector3<f64>) -> Option<Covariance<7>> {
+    let mut local = SMatrix::<f64, 7, 7>::zeros();
+    local.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(translation);
+    local.fixed_view_mut::<3, 3>(3, 3).copy_from(rotation);
+    local[(6, 6)] = scale;
+    let mut ad = SMatrix::<f64, 7, 7>::identity();
+    ad.fixed_view_mut::<3, 3>(0, 3).copy_from(&hat(c));
+    ad.fixed_view_mut::<3, 1>(0, 6).copy_from(&-c);
+    representable(ad * local * ad.transpose())
+}
+
+/// The covariance, widened by a hair where a far origin makes it singular in double precision.
+fn representable<const N: usize>(m: SMatrix<f64, N, N>) -> Option<Covariance<N>> {
+    let m = (m + m.transpose()) * 0.5;
+    let widened = || m + SMatrix::from_diagonal(&(m.diagonal() * 1e-11));
+    Covariance::new(m).or_else(|_| Covariance::new(widened())).ok()
+}
+
+/// d F₀.₉₅(d, ν) / χ²₀.₉₅(d): how much wider the 95 % ellipsoid is when σ̂² has ν degrees of freedom.
+fn inflation(freedom: f64, with_scale: bool) -> f64 {
+    let _ = with_scale;
+    let nu = freedom.max(3.0);
+    nu / (nu - 2.0)
+}
