@@ -1,13 +1,13 @@
 //! Turns a finished submap into what others and its owner need of it. Heavy (about 20 µs a point) and pure: it runs as
 //! a job.
 
+use super::Submap;
 use super::block::Block;
 use super::cloud::{self, Index, NORMAL_RADIUS_VOXELS, Neighbour, Normal};
 use super::descriptor::{self, DIMENSIONS, NEIGHBOURS_MAX, Packed, RADIUS_VOXELS};
-use super::features::{KEYPOINTS_MAX, FEATURES_MAX, Features, Keypoints};
+use super::features::{FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints};
 use super::sampling::spread;
 use super::summary::Summary;
-use super::Submap;
 use crate::config::SubmapConfig;
 use nalgebra::Vector3;
 
@@ -87,3 +87,7 @@ fn most_distinct(candidates: &[usize], descriptors: &[Packed]) -> Vec<usize> {
     ranked.truncate((ranked.len() as f64 * DISTINCT_SHARE).ceil() as usize);
     ranked.into_iter().map(|(_, k)| k).collect()
 }
+
+#[cfg(test)]
+#[path = "describe_tests.rs"]
+mod tests;

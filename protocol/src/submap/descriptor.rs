@@ -65,7 +65,9 @@ fn own_histogram(k: usize, points: &[Vector3<f64>], normals: &[Normal], neighbou
             continue;
         };
         pairs += 1.0;
-        for (part, (angle, low, high)) in angles.iter().zip([(-PI, PI), (-1.0, 1.0), (-1.0, 1.0)]).map(|(a, (l, h))| (*a, l, h)).enumerate() {
+        for (part, (angle, low, high)) in
+            angles.iter().zip([(-PI, PI), (-1.0, 1.0), (-1.0, 1.0)]).map(|(a, (l, h))| (*a, l, h)).enumerate()
+        {
             let bin = (BINS as f64 * (angle - low) / (high - low)).floor().clamp(0.0, (BINS - 1) as f64) as usize;
             histogram[part * BINS + bin] += 1.0;
         }

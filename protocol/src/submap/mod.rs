@@ -21,6 +21,8 @@ mod odometry;
 pub mod refine;
 mod sampling;
 pub mod summary;
+#[cfg(test)]
+mod testing;
 mod thinning;
 
 pub use block::{BlockError, Surfel};
