@@ -5,7 +5,7 @@ use super::Submap;
 use super::block::Block;
 use super::cloud::{self, Index, NORMAL_RADIUS_VOXELS, Neighbour, Normal};
 use super::descriptor::{self, DIMENSIONS, NEIGHBOURS_MAX, Packed, RADIUS_VOXELS};
-use super::features::{FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints};
+use super::features::{FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints, UNSEEN, VIEWPOINTS_MAX};
 use super::sampling::spread;
 use super::summary::Summary;
 use crate::config::SubmapConfig;
@@ -60,9 +60,19 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     let candidates = most_distinct(&candidates, &descriptors);
     let order = spread(&points, &candidates, config.voxel_m, config.keypoints.min(KEYPOINTS_MAX));
     keypoints.points.extend(order.iter().filter_map(|&k| stored[k]));
+    let seen_from = |k: usize| -> u8 {
+        let from = submap.seen_from.get(k).filter(|&&from| usize::from(from) < VIEWPOINTS_MAX);
+        from.and_then(|&from| u8::try_from(from).ok()).unwrap_or(UNSEEN)
+    };
+    let kept: Vec<usize> = (0..points.len()).filter(|&k| stored[k].is_some()).collect();
     features.points.extend(stored.into_iter().flatten());
-
-    let (features, keypoints) = (Features(features), Keypoints(keypoints));
+    let viewpoints = submap.keyframes.iter().take(VIEWPOINTS_MAX);
+    let features = Features {
+        block: features,
+        viewpoints: viewpoints.map(|t_anchor_body| t_anchor_body.translation.map(|x| x as f32).into()).collect(),
+        seen_from: kept.into_iter().map(seen_from).collect(),
+    };
+    let keypoints = Keypoints(keypoints);
     let summary = Summary::of(&features);
     Described { features, keypoints, summary, extent: extent.map(|e| e as f32) }
 }

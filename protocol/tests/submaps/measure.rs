@@ -61,10 +61,15 @@ pub fn trial(theirs: &Place, mine: &Place, keypoints: usize, truth: Option<&Se3>
 #[derive(Default)]
 pub struct Score {
     pub directions: usize,
-    pub accepted: usize,
-    /// Accepted and within the set's rule.
+    /// The solver's pose accepted and within the set's rule.
     pub right: usize,
+    /// The solver's pose accepted and not.
     pub wrong: usize,
+    /// Refined, within the rule.
+    pub refined: usize,
+    /// Refined, and not within the rule: false alignments that nothing here caught.
+    pub false_refined: usize,
+    pub matches: f64,
     pub inlier_ratio: f64,
     pub nees: Vec<f64>,
     pub degrees: Vec<f64>,
@@ -76,31 +81,35 @@ pub struct Score {
 impl Score {
     pub fn of(set: &Set, keypoints: usize) -> Self {
         let mut score = Self::default();
-        for (theirs, mine, truth) in overlapping(set) {
-            let trial = trial(theirs, mine, keypoints, Some(&truth));
-            score.directions += 1;
-            score.inlier_ratio += trial.inlier_ratio;
-            let Some(rough) = trial.rough else { continue };
-            score.accepted += 1;
-            let (degrees, metres) = difference(&rough, &truth);
-            if degrees < set.rotation_deg_max && metres < set.translation_max {
-                score.right += 1;
-            } else {
-                score.wrong += 1;
-            }
-            if let Some(refined) = trial.refined {
-                let covariance = refined.pose.covariance;
-                let (degrees, metres) = difference(&refined.pose.pose, &truth);
-                score.nees.push(covariance.mahalanobis_squared(&refined.pose.pose.local(&truth)));
-                score.degrees.push(degrees);
-                score.metres.push(metres);
-                let sigmas = covariance.sigmas();
-                score.sigma_metres.push(sigmas.fixed_rows::<3>(0).norm());
-                score.sigma_degrees.push(sigmas.fixed_rows::<3>(3).norm().to_degrees());
-            }
+        let directions = overlapping(set);
+        score.directions = directions.len();
+        for (theirs, mine, truth) in directions {
+            score.add(set, &trial(theirs, mine, keypoints, Some(&truth)), &truth);
         }
-        score.inlier_ratio /= score.directions.max(1) as f64;
         score
+    }
+
+    fn add(&mut self, set: &Set, trial: &Trial, truth: &Se3) {
+        self.inlier_ratio += trial.inlier_ratio / self.directions as f64;
+        self.matches += trial.matches as f64 / self.directions as f64;
+        let is_right = |pose: &Se3| {
+            let (degrees, metres) = difference(pose, truth);
+            degrees < set.rotation_deg_max && metres < set.translation_max
+        };
+        let Some(rough) = trial.rough else { return };
+        let count = if is_right(&rough) { &mut self.right } else { &mut self.wrong };
+        *count += 1;
+        let Some(refined) = &trial.refined else { return };
+        let count = if is_right(&refined.pose.pose) { &mut self.refined } else { &mut self.false_refined };
+        *count += 1;
+        let covariance = refined.pose.covariance;
+        let (degrees, metres) = difference(&refined.pose.pose, truth);
+        self.nees.push(covariance.mahalanobis_squared(&refined.pose.pose.local(truth)));
+        self.degrees.push(degrees);
+        self.metres.push(metres);
+        let sigmas = covariance.sigmas();
+        self.sigma_metres.push(sigmas.fixed_rows::<3>(0).norm());
+        self.sigma_degrees.push(sigmas.fixed_rows::<3>(3).norm().to_degrees());
     }
 
     /// Mean NEES over the refined directions.
@@ -115,16 +124,19 @@ impl Score {
 
     pub fn line(&self, name: &str, keypoints: usize) -> String {
         format!(
-            "{name:>10} N={keypoints:<4} inlier ratio {:.3}  found {}/{} wrong {}  refined {}: NEES mean {:.2} median {:.2}, \
-             in 95 % {:.2}, error median {:.2}° {:.3} m, stated {:.2}° {:.3} m",
+            "{name:>8} N={keypoints:<4} matches {:.0}, inlier ratio {:.3}; solver right {} wrong {} of {}; refined right {} \
+             wrong {}; NEES mean {:.2} median {:.2}, {:.0} % in the 95 % ellipsoid; median error {:.2}° {:.3} m, stated \
+             {:.2}° {:.3} m",
+            self.matches,
             self.inlier_ratio,
             self.right,
-            self.directions,
             self.wrong,
-            self.nees.len(),
+            self.directions,
+            self.refined,
+            self.false_refined,
             self.nees_mean(),
             median(&self.nees),
-            self.covered(),
+            100.0 * self.covered(),
             median(&self.degrees),
             median(&self.metres),
             median(&self.sigma_degrees),

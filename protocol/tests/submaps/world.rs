@@ -119,7 +119,7 @@ impl World {
     pub fn set(&self, name: &'static str, count: usize, spread: [f64; 2], drift: f64, seed: u64) -> Set {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let places = (0..count).map(|_| self.drive(spread, 0.02, drift, VOXEL, &mut rng)).collect();
-        Set { name, config: config(VOXEL, 5), places, rotation_deg_max: 5.0, translation_max: 0.4 }
+        Set { name, places, rotation_deg_max: 5.0, translation_max: 0.4 }
     }
 }
 
