@@ -2,13 +2,19 @@
 //! [`Features`] are all of them, kept privately by the owner. Both share one bounded layout; keypoints are the prefix
 //! of a priority order, so fewer are cut from more by keeping the first.
 
-use super::block::{Block, BlockError, Surfel};
+use super::block::{Block, BlockError, HEADER_LEN, POINT_LEN, Surfel};
 use super::descriptor::{self, DIMENSIONS};
+use nalgebra::Vector3;
 
 /// Keypoints in a blob at most.
 pub const KEYPOINTS_MAX: usize = 1024;
 /// Features of a submap at most.
 pub const FEATURES_MAX: usize = 1_000_000;
+
+/// Viewpoints kept with features at most (the first of the submap).
+pub const VIEWPOINTS_MAX: usize = 32;
+/// Stands for a viewpoint that was not kept.
+pub const UNSEEN: u8 = 255;
 
 const KEYPOINTS_MAGIC: [u8; 2] = *b"mk";
 const FEATURES_MAGIC: [u8; 2] = *b"mf";
@@ -17,9 +23,15 @@ const FEATURES_MAGIC: [u8; 2] = *b"mf";
 #[derive(Clone, Debug, PartialEq)]
 pub struct Keypoints(pub(super) Block);
 
-/// All described points of one's own submap, in the anchor frame.
+/// All described points of one's own submap, in the anchor frame, and from where they were seen.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Features(pub(super) Block);
+pub struct Features {
+    pub(super) block: Block,
+    /// Positions of the keyframes.
+    pub(super) viewpoints: Vec<[f32; 3]>,
+    /// For each point, the position in `viewpoints` of the keyframe that saw it first, or [`UNSEEN`].
+    pub(super) seen_from: Vec<u8>,
+}
 
 impl Keypoints {
     /// The blob: at most 18 + 26 × [`KEYPOINTS_MAX`] bytes.
@@ -45,9 +57,24 @@ impl Keypoints {
 }
 
 impl Features {
-    /// The features as a private disk record, 26 bytes a point.
+    /// Positions of the keyframes, in the anchor frame.
+    pub(super) fn viewpoints(&self) -> Vec<Vector3<f64>> {
+        self.viewpoints.iter().map(|p| Vector3::from(p.map(f64::from))).collect()
+    }
+
+    /// For each point, the position among the viewpoints of the one that saw it first, or [`UNSEEN`].
+    pub(super) fn seen_from(&self) -> &[u8] {
+        &self.seen_from
+    }
+
+    /// The features as a private disk record: viewpoints (12 bytes each, one byte for their number), one byte a point
+    /// that tells which saw it, then 26 bytes a point.
     pub fn encode(&self) -> Vec<u8> {
-        self.0.encode(FEATURES_MAGIC)
+        let mut bytes = self.block.encode(FEATURES_MAGIC);
+        bytes.extend(&self.seen_from);
+        self.viewpoints.iter().flatten().for_each(|x| bytes.extend(x.to_le_bytes()));
+        bytes.push(self.viewpoints.len() as u8);
+        bytes
     }
 
     /// Parses a record.
@@ -55,39 +82,61 @@ impl Features {
     /// # Errors
     /// [`BlockError`] if the bytes are not exactly what [`Features::encode`] writes.
     pub fn decode(bytes: &[u8]) -> Result<Self, BlockError> {
-        Block::decode(bytes, FEATURES_MAGIC, FEATURES_MAX).map(Self)
+        let cut = || BlockError::NoHeader { len: bytes.len() };
+        let (&count, rest) = bytes.split_last().ok_or_else(cut)?;
+        let count = usize::from(count);
+        let split = rest.len().checked_sub(12 * count).filter(|_| count <= VIEWPOINTS_MAX).ok_or_else(cut)?;
+        let (rest, viewpoints) = rest.split_at(split);
+        let viewpoints: Vec<[f32; 3]> = viewpoints
+            .as_chunks::<12>()
+            .0
+            .iter()
+            .map(|p| core::array::from_fn(|k| f32::from_le_bytes([p[4 * k], p[4 * k + 1], p[4 * k + 2], p[4 * k + 3]])))
+            .collect();
+        if viewpoints.iter().flatten().any(|x| !x.is_finite()) {
+            return Err(BlockError::BadScale);
+        }
+        // What remains is the block and one byte for each of its points.
+        let points = rest.len().saturating_sub(HEADER_LEN) / (POINT_LEN + 1);
+        let (block, seen_from) = rest.split_at(rest.len() - points);
+        let block = Block::decode(block, FEATURES_MAGIC, FEATURES_MAX)?;
+        let good = |&&seen: &&u8| seen == UNSEEN || usize::from(seen) < count;
+        match seen_from.iter().position(|seen| !good(&seen)) {
+            Some(index) => Err(BlockError::NotCanonical { index }),
+            None => Ok(Self { block, viewpoints, seen_from: seen_from.to_vec() }),
+        }
     }
 }
 
 macro_rules! described_points {
-    ($($kind:ty),*) => {$(
+    ($($kind:ty, $block:tt);*) => {$(
         impl $kind {
             /// Number of points.
             pub fn len(&self) -> usize {
-                self.0.points.len()
+                self.$block.points.len()
             }
 
             /// Whether there are none.
             pub fn is_empty(&self) -> bool {
-                self.0.points.is_empty()
+                self.$block.points.is_empty()
             }
 
             /// Edge of the voxel that the cloud was thinned to, frame units.
             pub fn voxel(&self) -> f64 {
-                self.0.voxel()
+                self.$block.voxel()
             }
 
             /// The points as pieces of surface.
             pub fn surfels(&self) -> Vec<Surfel> {
-                self.0.surfels()
+                self.$block.surfels()
             }
 
             /// The levels (0 to 15) of each point's descriptor.
             pub fn descriptors(&self) -> Vec<[u8; DIMENSIONS]> {
-                self.0.points.iter().map(|p| descriptor::unpack(&p.descriptor)).collect()
+                self.$block.points.iter().map(|p| descriptor::unpack(&p.descriptor)).collect()
             }
         }
     )*};
 }
 
-described_points!(Keypoints, Features);
+described_points!(Keypoints, 0; Features, block);

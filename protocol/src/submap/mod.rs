@@ -21,7 +21,10 @@ mod odometry;
 pub mod refine;
 mod sampling;
 pub mod summary;
+#[cfg(test)]
+mod testing;
 mod thinning;
+mod visibility;
 
 pub use block::{BlockError, Surfel};
 pub use builder::{KeyframeError, Submap, SubmapBuilder};
@@ -30,6 +33,7 @@ pub use features::{Features, Keypoints};
 pub use matching::{Matches, fit, match_keypoints};
 pub use refine::{RefineConfig, RefineError, Refined, refine};
 pub use summary::{SUMMARY_LEN_MAX, Summary, SummaryError};
+pub use visibility::contradiction;
 
 use crate::geometry::PoseWithCovariance;
 use crate::time::Stamp;
