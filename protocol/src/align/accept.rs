@@ -1,13 +1,13 @@
 //! Whether a consensus could be chance: the number of false alarms (NFA), the expected number of equally good alignments
 //! in random matches (MATH §4.3).
 //!
-//! `NFA = (n − 3) C(n, k) π₃ α^(k − 3)`: α is the share of the outlier volume within the k-th smallest residual, and π₃
-//! the chance that a random triangle is rigid to that accuracy at all, measured on the problem's own edge lengths. MATH's
-//! C(k, 3) is absent: it counts each subset once for each of its triangles. Evidence is not used: on pure outliers it accepts 76–100 % (*measured*).
+//! `NFA = (n − 3) C(n, k) π₃ α^(k − 3)`: α is the chance that a random target lies within the k-th smallest residual of
+//! a given place, and π₃ the chance that a random triangle is rigid to that accuracy at all; both are measured on the
+//! problem ([`super::chance`]). MATH's C(k, 3) is absent: it counts each subset once for each of its triangles. Evidence is
+//! not used: on pure outliers it accepts 76–100 % (*measured*).
 
 use super::prepare::Matches;
 use super::refine::{Context, Fit};
-use core::f64::consts::PI;
 use libm::{log, log10};
 
 /// Fewest matches that can be significant.
@@ -59,12 +59,8 @@ pub(super) fn significance(
             continue;
         }
         let r = fit.squared[i as usize].sqrt().max(floor) * unit;
-        let ball = 4.0 / 3.0 * PI * r * r * r;
-        let alpha = (ball / matches.volume(4.0 / 3.0 * r)).min(1.0);
-        let rigid = matches.length_agreement(fit.motion.scale, 2.0 * r);
-        let sides = if context.with_scale { 2.0 } else { 3.0 };
-        let log10_nfa =
-            (log(n_f - 3.0) + choose + sides * log(rigid) + drawn * log(alpha)) * core::f64::consts::LOG10_E;
+        let (rigid, alpha) = (matches.chance.rigid_triangle(2.0 * r), matches.chance.alpha(r));
+        let log10_nfa = (log(n_f - 3.0) + choose + log(rigid) + drawn * log(alpha)) * core::f64::consts::LOG10_E;
         if log10_nfa < best.log10_nfa {
             best = Significance { log10_nfa, count: rank + 1 };
         }

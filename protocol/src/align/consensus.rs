@@ -64,12 +64,10 @@ struct Stage {
 
 impl<'a> Search<'a> {
     fn new(matches: &'a Matches, config: &'a SolverConfig) -> Self {
-        let (with_scale, scale_range) = match config.model {
-            Model::Rigid => (false, (1.0, 1.0)),
-            Model::Similarity { scale_min, scale_max } => (true, (scale_min, scale_max)),
-        };
+        let with_scale = matches!(config.model, Model::Similarity { .. });
+        let scale_range = config.model.scale_range();
         let sigma_max = config.sigma_max;
-        let volume = matches.volume(4.0 * sigma_max);
+        let volume = matches.chance.volume(2.0 * sigma_max);
         Self {
             context: Context { matches, with_scale, scale_range, sigma_max, volume },
             config,
@@ -77,7 +75,7 @@ impl<'a> Search<'a> {
             candidates: Vec::new(),
             refine: refine::Scratch::default(),
             accept: accept::Scratch::default(),
-            refused: Significance { log10_nfa: f64::INFINITY, count: 0 },
+            refused: Significance { log10_nfa: libm::log10(matches.len().max(1) as f64), count: 0 },
             refused_support: 0.0,
             degenerate: None,
         }
@@ -180,8 +178,11 @@ impl<'a> Search<'a> {
     }
 
     fn conclude(&mut self, best: Evaluated) -> Result<Alignment, Refusal> {
-        let fit = refine::reweight(&self.context, best.fit, self.config.weighting, &mut self.refine);
-        let Some(Estimate { relative, eigenvalues, .. }) = covariance::estimate(&self.context, &fit) else {
+        let reweighted = refine::reweight(&self.context, &best.fit, self.config.weighting, &mut self.refine)
+            .and_then(|fit| covariance::estimate(&self.context, &fit).map(|estimate| (fit, estimate)))
+            .filter(|(_, estimate)| estimate.rotation_sigma <= self.config.rotation_sigma_max);
+        let plain = || covariance::estimate(&self.context, &best.fit).map(|estimate| (best.fit.clone(), estimate));
+        let Some((fit, Estimate { relative, eigenvalues, .. })) = reweighted.or_else(plain) else {
             return Err(Refusal::Degenerate { rotation_sigma: f64::INFINITY });
         };
         let matches = self.context.matches;

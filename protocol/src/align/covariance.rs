@@ -11,6 +11,9 @@ use crate::geometry::so3::hat;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 
+/// Degrees of freedom of σ̂² assumed at least.
+const FREEDOM_MIN: f64 = 4.0;
+
 /// An alignment with its uncertainty.
 #[derive(Clone, Debug)]
 pub(super) struct Estimate {
@@ -132,9 +135,28 @@ fn representable<const N: usize>(m: SMatrix<f64, N, N>) -> Option<Covariance<N>>
     Covariance::new(m).or_else(|_| Covariance::new(widened())).ok()
 }
 
-/// d F₀.₉₅(d, ν) / χ²₀.₉₅(d): how much wider the 95 % ellipsoid is when σ̂² has ν degrees of freedom.
+/// How much wider the 95 % ellipsoid is when σ̂² has ν degrees of freedom: d F₀.₉₅(d, ν) / χ²₀.₉₅(d), which is
+/// 1 + 4.3/(ν − 2) for d = 6 and 1 + 4.5/(ν − 2) for d = 7 within 2 % from ν = 6 on. MATH's ν/(ν − 2) fits the mean of d²
+/// instead and covers less.
 fn inflation(freedom: f64, with_scale: bool) -> f64 {
-    let _ = with_scale;
-    let nu = freedom.max(3.0);
-    nu / (nu - 2.0)
+    let excess = if with_scale { 4.5 } else { 4.3 };
+    1.0 + excess / (freedom.max(FREEDOM_MIN) - 2.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use statrs::distribution::{ChiSquared, ContinuousCDF, FisherSnedecor};
+
+    #[test]
+    fn inflation_is_that_of_the_f_distribution() {
+        for (d, with_scale) in [(6.0, false), (7.0, true)] {
+            let chi = ChiSquared::new(d).expect("positive").inverse_cdf(0.95);
+            for nu in [6.0, 9.0, 15.0, 24.0, 60.0, 300.0, 3000.0] {
+                let f = FisherSnedecor::new(d, nu).expect("positive").inverse_cdf(0.95);
+                let ratio = inflation(nu, with_scale) / (d * f / chi);
+                assert!((ratio - 1.0).abs() < 0.02, "d = {d}, ν = {nu}: {ratio}");
+            }
+        }
+    }
 }

@@ -1,15 +1,13 @@
 //! From a hostile slice of matches to a canonical, bounded problem: checked, sorted (so that order changes nothing),
 //! exact duplicates merged, centred on medians, best scores first.
 
+use super::chance::Chance;
 use super::{AlignError, COORDINATE_MAX, Problem, SolverConfig};
 use core::cmp::Ordering;
 use core::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
-
-/// Pairs drawn to learn how often lengths agree by chance.
-const LENGTH_PAIRS: usize = 2048;
 
 /// Distinct matches in search order, centred.
 #[derive(Debug)]
@@ -30,25 +28,14 @@ pub(super) struct Matches {
     pub inliers_max: usize,
     /// Robust extents of the target along its principal axes; a uniform box of the same spread.
     pub target_extent: [f64; 3],
-    /// Lengths of random source edges and of their target edges.
-    pub length_pairs: Vec<(f64, f64)>,
+    /// How often its matches agree by chance.
+    pub chance: Chance,
 }
 
 impl Matches {
     /// Number of distinct matches.
     pub fn len(&self) -> usize {
         self.source.len()
-    }
-
-    /// Volume in which a wrong match may fall; thin axes count at least `thickness`.
-    pub fn volume(&self, thickness: f64) -> f64 {
-        self.target_extent.iter().map(|l| l.max(thickness)).product()
-    }
-
-    /// How often a random pair of matches agrees in length within `tolerance`, after scaling the source.
-    pub fn length_agreement(&self, scale: f64, tolerance: f64) -> f64 {
-        let agreeing = self.length_pairs.iter().filter(|(a, b)| (scale * a - b).abs() <= tolerance).count();
-        (agreeing as f64 + 1.0) / (self.length_pairs.len() as f64 + 1.0)
     }
 }
 
@@ -76,9 +63,10 @@ pub(super) fn prepare(problem: &Problem, config: &SolverConfig) -> Result<Matche
     let (source_centre, target_centre) = (median(&source), median(&target));
     let centred = |points: &[[f64; 3]], centre| points.iter().map(|&p| Vector3::from(p) - centre).collect::<Vec<_>>();
     let (source, target) = (centred(&source, source_centre), centred(&target, target_centre));
+    let target_extent = extent(&target);
     Ok(Matches {
-        target_extent: extent(&target),
-        length_pairs: length_pairs(&source, &target, &mut rng),
+        chance: Chance::measure(&source, &target, config.model.scale_range(), target_extent, &mut rng),
+        target_extent,
         repeats: sources.min(targets) < source.len(),
         inliers_max: sources.min(targets),
         source,
@@ -198,20 +186,4 @@ fn extent(points: &[Vector3<f64>]) -> [f64; 3] {
         let spread = (12.0 * axes.eigenvalues[k].max(0.0)).sqrt();
         spread.min((high_value - low_value) / 0.9)
     })
-}
-
-fn length_pairs(source: &[Vector3<f64>], target: &[Vector3<f64>], rng: &mut ChaCha8Rng) -> Vec<(f64, f64)> {
-    let n = source.len() as u64;
-    if n < 2 {
-        return Vec::new();
-    }
-    (0..LENGTH_PAIRS)
-        .map(|_| {
-            let bits = rng.next_u64();
-            let i = ((bits >> 32) * n) >> 32;
-            let j = (i + 1 + (((bits & 0xffff_ffff) * (n - 1)) >> 32)) % n;
-            let (i, j) = (i as usize, j as usize);
-            ((source[i] - source[j]).norm(), (target[i] - target[j]).norm())
-        })
-        .collect()
 }

@@ -21,6 +21,8 @@ const KDE_REACH: f64 = 8.0;
 const KDE_SAMPLES_MAX: usize = 512;
 /// The standard deviation of a χ₃ norm, in σ: the spread that bounds the kernel density's bandwidth.
 const CHI3_SPREAD: f64 = 0.673_4;
+/// Support below which a density of residuals says little.
+const KDE_SUPPORT_MIN: f64 = 20.0;
 /// Held-out log-likelihood by which kernel density must win.
 const KDE_MARGIN: f64 = 3.0;
 
@@ -179,15 +181,14 @@ fn one_to_one(matches: &Matches, fit: &mut Fit, scratch: &mut Scratch) {
     }
 }
 
-/// Reweights by kernel density as `weighting` asks; `Auto` keeps whichever predicts held-out residuals better.
-pub(super) fn reweight(context: &Context, fit: Fit, weighting: Weighting, scratch: &mut Scratch) -> Fit {
-    if weighting == Weighting::Em {
-        return fit;
-    }
-    if weighting == Weighting::Auto && held_out_gain(context, &fit, scratch) < KDE_MARGIN {
-        return fit;
-    }
-    kernel_density(context, &fit, scratch).unwrap_or(fit)
+/// The fit by kernel density weights, if `weighting` wants it: `Auto` does where it predicts held-out residuals better.
+pub(super) fn reweight(context: &Context, fit: &Fit, weighting: Weighting, scratch: &mut Scratch) -> Option<Fit> {
+    let wanted = match weighting {
+        Weighting::Em => false,
+        Weighting::Kde => true,
+        Weighting::Auto => fit.support() >= KDE_SUPPORT_MIN && held_out_gain(context, fit, scratch) > KDE_MARGIN,
+    };
+    wanted.then(|| kernel_density(context, fit, scratch)).flatten()
 }
 
 /// Iterative reweighting by `p = 1 − (outlier density) / (kernel density of all residuals)`, not rising beyond σ̂.
