@@ -32,7 +32,7 @@ fn collect(folder: &Path, files: &mut Vec<PathBuf>) -> io::Result<()> {
     Ok(())
 }
 
-#[expect(clippy::print_stdout, reason = "how a build script talks to cargo")]
+/// How a build script talks to cargo.
 fn println_cargo(line: &str) {
     println!("cargo::{line}");
 }

@@ -96,10 +96,10 @@ pub fn run(args: DemoArgs) -> Result<bool> {
     say(&report::checks(&evaluation.checks))?;
     say(&format!("Written to {}: {files}", out.display()))?;
     if !evaluation.held() {
-        say(&format!(
-            "Not every check held. The agents' files are in {}; the ends of their logs:\n{tails}",
-            work.display()
-        ))?;
+        say(&format!("Not every check held. The agents' files are in {}.", work.display()))?;
+        if seen.ending != Ending::Done {
+            say(&format!("The ends of their logs:\n{tails}"))?;
+        }
         return Ok(false);
     }
     if !args.keep {

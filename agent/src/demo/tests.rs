@@ -284,7 +284,7 @@ fn the_best_rigid_fit_is_found_also_for_points_in_a_plane() {
     let t = pose([1.0, -2.0, 0.5], [0.3, 2.0, -1.0]);
     for flat in [1.0, 0.0] {
         let points: Vec<Vector3<f64>> =
-            (0..9).map(|i| f64::from(i)).map(|i| Vector3::new(i, (i * 1.7).sin(), flat * (i * 0.6).cos())).collect();
+            (0..9).map(f64::from).map(|i| Vector3::new(i, (i * 1.7).sin(), flat * (i * 0.6).cos())).collect();
         let moved: Vec<_> = points.iter().map(|p| t * *p).collect();
         assert!(t.local(&fit(&points, &moved)).norm() < 1e-9, "flat {flat}");
     }

@@ -68,7 +68,7 @@ pub fn draw(scene: &Scene) -> String {
     let panels = [0.0, 1.0].map(|i| [MARGIN + i * (width + MARGIN), HEAD, width, height]);
     let merged: Vec<Vector3<f64>> = scene.robots.iter().flat_map(|robot| &robot.merged.0).copied().collect();
     let plan = plan(&merged, &scene.up);
-    let sides: [fn(&Robot) -> &(Vec<Vector3<f64>>, Vec<Vector3<f64>>); 2] = [|r| &r.alone, |r| &r.merged];
+    let sides: [Side; 2] = [|r| &r.alone, |r| &r.merged];
     let boxes = sides.map(|side| bounds(scene, &plan, side));
     let fit = |b: &[[f64; 2]; 2]| ((width - 40.0) / (b[1][0] - b[0][0])).min((height - 80.0) / (b[1][1] - b[0][1]));
     let scales = boxes.map(|corners| fit(&corners).clamp(1e-6, 1e6));
@@ -87,6 +87,8 @@ pub fn draw(scene: &Scene) -> String {
         }
         svg.end_group();
         let [x, y, ..] = panels[index];
+        let width = 7.6 * captions[index].len() as f64 + 20.0;
+        svg.rect([x + 6.0, y + 6.0, width, 32.0], PANEL, "rx=\"4\" fill-opacity=\"0.85\"");
         svg.text([x + 16.0, y + 28.0], 17.0, INK, Anchor::Start, captions[index]);
         scale_bar(&mut svg, &view);
     }
@@ -121,30 +123,29 @@ type Side = fn(&Robot) -> &(Vec<Vector3<f64>>, Vec<Vector3<f64>>);
 
 /// Corners of what a panel shows: all paths, and the map without its outer hundredths.
 fn bounds(scene: &Scene, plan: &Matrix2x3<f64>, side: Side) -> [[f64; 2]; 2] {
-    let mut corners = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
-    for robot in &scene.robots {
-        let (map, path) = side(robot);
-        for axis in 0..2 {
-            let mut along: Vec<f64> = map.iter().map(|p| (plan * p)[axis]).collect();
-            along.sort_by(f64::total_cmp);
-            let cut = along.len() / 100;
-            let kept = along.get(cut..along.len() - cut).unwrap_or_default();
-            let ends = kept.first().into_iter().chain(kept.last()).copied();
-            for value in ends.chain(path.iter().map(|p| (plan * p)[axis])) {
-                corners[0][axis] = corners[0][axis].min(value);
-                corners[1][axis] = corners[1][axis].max(value);
-            }
+    let spans = [0, 1].map(|axis| span(scene, plan, side, axis));
+    [spans.map(|(low, _)| low), spans.map(|(_, high)| high)]
+}
+
+/// Least and greatest plan coordinate along one axis.
+fn span(scene: &Scene, plan: &Matrix2x3<f64>, side: Side, axis: usize) -> (f64, f64) {
+    let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+    for (map, path) in scene.robots.iter().map(side) {
+        let mut along: Vec<f64> = map.iter().map(|p| (plan * p)[axis]).collect();
+        along.sort_by(f64::total_cmp);
+        let cut = along.len() / 100;
+        let kept = along.get(cut..along.len() - cut).unwrap_or_default();
+        let ends = kept.first().into_iter().chain(kept.last()).copied();
+        for value in ends.chain(path.iter().map(|p| (plan * p)[axis])) {
+            (low, high) = (low.min(value), high.max(value));
         }
     }
     // Nothing to show, or a single point: a metre around it.
-    for axis in 0..2 {
-        if !(corners[1][axis] - corners[0][axis]).is_finite() {
-            (corners[0][axis], corners[1][axis]) = (-1.0, 1.0);
-        } else if corners[1][axis] - corners[0][axis] < 1e-3 {
-            (corners[0][axis], corners[1][axis]) = (corners[0][axis] - 1.0, corners[1][axis] + 1.0);
-        }
+    match high - low {
+        width if !width.is_finite() => (-1.0, 1.0),
+        width if width < 1e-3 => (low - 1.0, high + 1.0),
+        _ => (low, high),
     }
-    corners
 }
 
 fn middle(corners: &[[f64; 2]; 2]) -> [f64; 2] {
@@ -175,7 +176,7 @@ fn maps(svg: &mut Svg, scene: &Scene, view: &View, side: Side) {
 
 fn truths_and_alignments(svg: &mut Svg, scene: &Scene, view: &View) {
     for [i, j] in &scene.alignments {
-        svg.line(&[view.pixel(i), view.pixel(j)], INK, 0.9, "stroke-opacity=\"0.28\"");
+        svg.line(&[view.pixel(i), view.pixel(j)], INK, 1.0, "stroke-opacity=\"0.4\"");
     }
     for robot in &scene.robots {
         svg.line(&view.pixels(&robot.truth), PAPER, 3.4, "stroke-opacity=\"0.8\"");
@@ -231,6 +232,7 @@ fn scale_bar(svg: &mut Svg, view: &View) {
     let decade = 10f64.powf(wanted.log10().floor());
     let metres = [5.0, 2.0, 1.0].map(|k| k * decade).into_iter().find(|m| *m <= wanted).unwrap_or(decade);
     let (right, bottom, length) = (x + w - 18.0, y + h - 18.0, metres * view.scale);
+    svg.rect([right - length - 9.0, bottom - 27.0, length + 18.0, 36.0], PANEL, "rx=\"4\" fill-opacity=\"0.85\"");
     svg.line(&[[right - length, bottom], [right, bottom]], INK, 2.0, "");
     for end in [right - length, right] {
         svg.line(&[[end, bottom - 4.0], [end, bottom + 4.0]], INK, 2.0, "");
@@ -245,7 +247,7 @@ fn legend(svg: &mut Svg, scene: &Scene, enlarged: f64) {
     let mut entry = |svg: &mut Svg, text: &str, sign: &dyn Fn(&mut Svg, f64)| {
         sign(svg, x);
         svg.text([x + 48.0, y + 5.5], 16.0, INK, Anchor::Start, text);
-        x += 48.0 + 30.0 + 7.9 * text.chars().count() as f64;
+        x += 48.0 + 30.0 + 8.4 * text.chars().count() as f64;
     };
     for robot in &scene.robots {
         entry(svg, &robot.name, &|svg, x| {
@@ -258,7 +260,8 @@ fn legend(svg: &mut Svg, scene: &Scene, enlarged: f64) {
         entry(svg, "true path", &|svg, x| svg.line(&[[x, y], [x + 34.0, y]], TRUE_PATH, 1.6, ""));
     }
     if !scene.alignments.is_empty() {
-        let text = format!("{} alignments used", scene.alignments.len());
+        let count = scene.alignments.len();
+        let text = if count == 1 { "1 alignment used".into() } else { format!("{count} alignments used") };
         entry(svg, &text, &|svg, x| svg.line(&[[x, y], [x + 34.0, y]], INK, 0.9, "stroke-opacity=\"0.5\""));
     }
     if scene.robots.iter().any(|robot| !robot.anchors.is_empty()) {

@@ -1,4 +1,4 @@
-//! Turns a finished submap into what others and its owner need of it. Heavy (about 20 µs a point) and pure: it runs as
+//! Turns a finished submap into what others and its owner need of it. Heavy (about 15 µs a point) and pure: it runs as
 //! a job.
 
 use super::Submap;
@@ -18,7 +18,7 @@ const KEYPOINT_NEIGHBOURS_MIN: usize = 8;
 /// ratio in a hall of boxes half as high again).
 const DISTINCT_SHARE: f64 = 0.5;
 
-/// What [`describe`] makes of a submap.
+/// What [`describe()`] makes of a submap.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Described {
     /// All points with normals and descriptors, for matching at home.

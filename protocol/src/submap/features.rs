@@ -140,3 +140,66 @@ macro_rules! described_points {
 }
 
 described_points!(Keypoints, 0; Features, block);
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{config, keyframe, room};
+    use super::super::{SubmapBuilder, describe};
+    use super::*;
+    use crate::geometry::{Se3, So3};
+    use proptest::prelude::*;
+
+    fn small() -> Features {
+        let mut builder = SubmapBuilder::new(config());
+        for k in 0..3 {
+            let pose = Se3::new(So3::identity(), Vector3::new(0.4 * f64::from(k), 0.0, 0.0));
+            let points: Vec<_> =
+                (0..12).map(|i| Vector3::new(0.1, f64::from(i % 4) * 0.1, f64::from(i / 4) * 0.1)).collect();
+            builder.push(keyframe(i64::from(k) + 1, pose, &points)).unwrap();
+        }
+        describe(&builder.flush().unwrap(), &config()).features
+    }
+
+    #[test]
+    fn a_record_holds_who_saw_what() {
+        let features = small();
+        assert_eq!(features.viewpoints.len(), 3);
+        assert!((0..3).all(|k| features.seen_from.contains(&k)));
+        assert_eq!(Features::decode(&features.encode()).unwrap(), features);
+        // Features and keypoints are told apart.
+        assert!(Keypoints::decode(&features.encode()).is_err());
+        assert!(Features::decode(&room(1).keypoints.encode()).is_err());
+    }
+
+    #[test]
+    fn every_truncation_extension_and_bad_viewpoint_is_refused() {
+        let features = small();
+        let bytes = features.encode();
+        for len in 0..bytes.len() {
+            assert!(Features::decode(&bytes[..len]).is_err(), "cut to {len}");
+        }
+        assert!(Features::decode(&[&bytes[..], &[3]].concat()).is_err());
+        let changed = |change: &dyn Fn(&mut Features)| {
+            let mut features = features.clone();
+            change(&mut features);
+            Features::decode(&features.encode())
+        };
+        assert!(changed(&|f| f.seen_from[1] = UNSEEN).is_ok());
+        assert_eq!(changed(&|f| f.seen_from[1] = 3), Err(BlockError::NotCanonical { index: 1 }));
+        assert_eq!(changed(&|f| f.viewpoints[0][2] = f32::NAN), Err(BlockError::BadScale));
+        assert!(changed(&|f| f.viewpoints.resize(VIEWPOINTS_MAX, [0.0; 3])).is_ok());
+        assert!(changed(&|f| f.viewpoints.resize(VIEWPOINTS_MAX + 1, [0.0; 3])).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn a_flipped_byte_is_refused_or_comes_back_the_same(at in any::<prop::sample::Index>(), with in any::<u8>()) {
+            let mut bytes = small().encode();
+            let at = at.index(bytes.len());
+            bytes[at] = with;
+            if let Ok(features) = Features::decode(&bytes) {
+                prop_assert_eq!(features.encode(), bytes);
+            }
+        }
+    }
+}

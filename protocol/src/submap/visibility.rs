@@ -76,3 +76,64 @@ impl View {
         looked
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{config, keyframe, room};
+    use super::super::{Described, SubmapBuilder, describe};
+    use super::*;
+    use crate::geometry::Se3;
+
+    fn wall(x: f64) -> impl Iterator<Item = Vector3<f64>> {
+        (0..1600).map(move |k| Vector3::new(x, f64::from(k % 40) * 0.1 - 2.0, f64::from(k / 40) * 0.1 - 2.0))
+    }
+
+    /// A bumpy board of 1 × 1 m, so that it offers keypoints.
+    fn board(x: f64) -> Vec<Vector3<f64>> {
+        let at =
+            |k: i32| Vector3::new(x + 0.15 * f64::from(k * 7 % 5), f64::from(k % 20) * 0.05, f64::from(k / 20) * 0.05);
+        (0..400).map(at).collect()
+    }
+
+    fn seen(points: &[Vector3<f64>]) -> Described {
+        let mut builder = SubmapBuilder::new(config());
+        builder.push(keyframe(1, Se3::identity(), points)).unwrap();
+        describe(&builder.flush().unwrap(), &config())
+    }
+
+    fn judged(theirs: &[Vector3<f64>], mine: &[Vector3<f64>]) -> f64 {
+        contradiction(&seen(theirs).keypoints, &seen(mine).features, &Sim3::identity(), 0.15)
+    }
+
+    #[test]
+    fn a_board_in_front_of_the_wall_i_saw_is_a_contradiction() {
+        let wall: Vec<_> = wall(4.0).collect();
+        assert_eq!(judged(&board(2.0), &wall), 1.0);
+        // Behind the wall, where I saw nothing, and beside it: I cannot tell.
+        assert_eq!(judged(&board(5.0), &wall), 0.0);
+        let beside: Vec<_> = board(2.0).iter().map(|p| p + Vector3::new(0.0, 5.0, 0.0)).collect();
+        assert_eq!(judged(&beside, &wall), 0.0);
+    }
+
+    #[test]
+    fn what_i_saw_myself_or_what_was_hidden_is_none() {
+        let both: Vec<_> = wall(4.0).chain(board(2.0)).collect();
+        assert_eq!(judged(&board(2.0), &both), 0.0);
+        // The board hides what stands between it and the wall.
+        let small: Vec<_> = board(3.2).iter().map(|p| p - Vector3::new(0.6, 0.0, 0.0)).collect();
+        let hidden: Vec<_> = small.iter().map(|p| Vector3::new(p.x + 0.6, 0.3 + p.y * 0.6, 0.3 + p.z * 0.6)).collect();
+        assert_eq!(judged(&hidden, &both), 0.0);
+    }
+
+    #[test]
+    fn points_of_another_keyframe_prove_nothing_and_empty_submaps_are_silent() {
+        let wall: Vec<_> = wall(4.0).collect();
+        let mut mine = seen(&wall).features;
+        mine.seen_from.fill(super::super::features::UNSEEN);
+        let theirs = seen(&board(2.0)).keypoints;
+        assert_eq!(contradiction(&theirs, &mine, &Sim3::identity(), 0.15), 0.0);
+        let (room, nothing) = (room(1), seen(&[]));
+        assert_eq!(contradiction(&room.keypoints, &nothing.features, &Sim3::identity(), 0.15), 0.0);
+        assert_eq!(contradiction(&nothing.keypoints, &room.features, &Sim3::identity(), 0.15), 0.0);
+    }
+}

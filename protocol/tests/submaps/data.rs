@@ -68,7 +68,7 @@ pub fn seven_scenes(data: &Path) -> Set {
     let poses: Vec<Se3> = fs::read_to_string(folder.join("poses_all_1000.txt"))
         .unwrap()
         .lines()
-        .map(|line| numbers(line))
+        .map(numbers)
         .map(|v| Se3::from_matrix(&Matrix4::from_row_slice(&v[1..17])))
         .collect();
     let config = config(0.05, 5);
