@@ -19,7 +19,7 @@ pub struct Trial {
     pub matches: usize,
     /// Share of right matches.
     pub inlier_ratio: f64,
-    /// The solver's pose, if accepted (support ≥ 8, fit).
+    /// The solver's pose, accepted or provisional, with support ≥ 8 and fit ≥ [`FIT_MIN`].
     pub rough: Option<Se3>,
     pub refined: Option<Refined>,
     pub support: f64,
@@ -35,7 +35,14 @@ pub fn trial(theirs: &Place, mine: &Place, keypoints: usize, truth: Option<&Se3>
         truth.is_some_and(|truth| (*truth * Vector3::from(**s) - Vector3::from(**t)).norm() < near)
     };
     let rights = found.source.iter().zip(&found.target).filter(right).count();
-    let config = SolverConfig { sigma_max: near, support_min: 8.0, seed: 7, ..Default::default() };
+    // What is only provisional for the solver is confirmed here by fit, refinement and the want of contradictions.
+    let config = SolverConfig {
+        sigma_max: near,
+        support_min: 8.0,
+        log10_nfa_provisional: Some(0.0),
+        seed: 7,
+        ..Default::default()
+    };
     let problem = Problem { source: &found.source, target: &found.target, scores: Some(&found.scores) };
     let solved = align(&problem, &config).unwrap();
     let mut trial = Trial {
