@@ -195,13 +195,14 @@ fn line(report: &Report, wall: f64) -> String {
 }
 
 fn table(report: &Report) -> String {
-    let mut text = format!("\n{:<10} {:>8} {:>8} {:>10}  merged with\n", "robot", "submaps", "facts", "bytes sent");
+    let mut text = format!("\n{:<10} {:>8} {:>8} {:>8} {:>10}  merged with\n", "robot", "submaps", "facts", "pending", "bytes sent");
     for robot in &report.robots {
         text += &format!(
-            "{:<10} {:>8} {:>8} {:>10}  {}\n",
+            "{:<10} {:>8} {:>8} {:>8} {:>10}  {}\n",
             robot.name,
             robot.submaps,
             robot.entries,
+            robot.pending,
             report.bytes_sent(&robot.name),
             robot.merged_with.join(" ")
         );

@@ -54,6 +54,10 @@ pub struct RobotReport {
     pub entries: u64,
     /// Own submaps.
     pub submaps: u64,
+    /// Work it has left, by its own account.
+    pub pending: u64,
+    /// Its estimate is of the present set, and nothing is pending.
+    pub idle: bool,
     /// Whom it has merged with.
     pub merged_with: Vec<String>,
 }
@@ -122,6 +126,8 @@ impl RobotReport {
             digest: sample.digest.to_string(),
             entries: status.map_or(0, |s| s.entries),
             submaps: status.map_or(0, |s| s.submaps),
+            pending: status.map_or(0, |s| s.pending),
+            idle: status.is_none_or(|s| s.idle),
             merged_with: status.map_or_else(Vec::new, |s| s.merged_with.clone()),
         }
     }

@@ -94,7 +94,7 @@ impl<C: Core> Swarm<C> {
         one.keyframes += 1;
         let t_world_frame = step.t_world_body * keyframe.pose.pose.inverse();
         self.feed(now, robot, Input::Keyframe(keyframe));
-        // The first keyframe of an epoch defines where its frame lies.
+        // Where the frame of a new epoch lies, until its first submap says it exactly.
         let one = &self.robots[robot];
         if let Some(core) = &one.core {
             self.truth.entry(format!("{}/{}", one.name, core.frame().epoch)).or_insert(t_world_frame);

@@ -21,11 +21,13 @@ use crate::network::{Network, millis};
 use crate::queue::Queue;
 use crate::scenario::Scenario;
 use crate::stage::{Stage, StageError};
+use crate::truth::rigid;
 use merganser_protocol::agent::io::{Channel, Command, Event as Told, Input, JobId, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
 use merganser_protocol::agent::{Restored, StartError};
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::ids::{NameError, RobotId};
+use merganser_protocol::snapshot::SubmapView;
 use merganser_protocol::time::Instant;
 use robot::{Robot, Slam, identities};
 use std::collections::BTreeMap;
@@ -220,6 +222,7 @@ impl<C: Core> Swarm<C> {
 
     fn finish(mut self, ended: Instant) -> Outcome<C> {
         let robots = self.robot_samples(ended);
+        self.pin_frames(&robots);
         if self.violation.is_none() {
             let sample =
                 Sample { phase: Phase::End, robots: robots.clone(), truth: &self.truth, expect: &self.scenario.expect };
@@ -410,6 +413,7 @@ impl<C: Core> Swarm<C> {
 
     fn sample(&mut self, now: Instant) {
         let robots = self.robot_samples(now);
+        self.pin_frames(&robots);
         let done = self.healed && all_done(&robots);
         self.done_samples = if done { self.done_samples + 1 } else { 0 };
         let phase = if self.healed { Phase::Calm } else { Phase::Storm };
@@ -433,6 +437,22 @@ impl<C: Core> Swarm<C> {
             })
         };
         self.robots.iter().filter_map(&mut sample).collect()
+    }
+
+    /// A frame truly lies where its first submap's anchor does: every estimate starts there. Until a robot has one, its
+    /// first keyframe stands in; they differ if a crash swallowed what came between.
+    fn pin_frames(&mut self, samples: &[RobotSample]) {
+        for snapshot in samples.iter().filter_map(|sample| sample.snapshot.as_ref()) {
+            let first = |s: &&SubmapView| s.index == 0 && s.robot == snapshot.status.robot;
+            for submap in snapshot.map.submaps.iter().filter(first) {
+                let Some(robot) = self.find(&submap.robot) else { continue };
+                let nanos = self.robots[robot].slam.drive_nanos(submap.stamps_secs[0]);
+                let step = self.stage.steps(robot).iter().min_by_key(|step| step.nanos.abs_diff(nanos));
+                if let (Some(step), Some(t_frame_anchor)) = (step, rigid(&submap.t_frame_anchor)) {
+                    self.truth.insert(submap.frame.clone(), step.t_world_body * t_frame_anchor.inverse());
+                }
+            }
+        }
     }
 
     fn see(&mut self, robot: usize, seen: &Seen<'_>) {

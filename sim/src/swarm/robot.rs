@@ -160,6 +160,11 @@ impl Slam {
         Self { stamp_offset, t_drive_frame: Se3::identity(), restart: false, motion: None }
     }
 
+    /// Time since the drive began of a stamp in seconds, ns: good to a microsecond.
+    pub fn drive_nanos(&self, stamp_secs: f64) -> u64 {
+        ((stamp_secs - self.stamp_offset as f64 * 1e-9).max(0.0) * 1e9) as u64
+    }
+
     /// The next keyframe begins a new frame.
     pub fn restart(&mut self) {
         self.restart = true;
@@ -217,4 +222,40 @@ pub(super) fn job_nanos(kind: &str, machine: &MachineOptions) -> u64 {
         _ => 150.0,
     };
     (ms * machine.slowness * 1e6) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn step(k: u64) -> Step {
+        let pose = |x: f64| Se3::new(merganser_protocol::geometry::So3::identity(), [x, 0.0, 0.0].into());
+        let covariance = Covariance::from_sigmas([0.1; 6]).unwrap();
+        let motion = PoseWithCovariance { pose: pose(1.0), covariance };
+        Step { nanos: k * 1_000_000_000, t_world_body: pose(k as f64), motion, t_frame_body: pose(k as f64) }
+    }
+
+    #[test]
+    fn a_keyframe_answers_for_the_motion_of_those_that_were_missed() {
+        let mut slam = Slam::new(-5.5);
+        let one = slam.keyframe(&step(1), Vec::new()).unwrap();
+        slam.skip(&step(2));
+        slam.skip(&step(3));
+        let four = slam.keyframe(&step(4), Vec::new()).unwrap();
+        let five = slam.keyframe(&step(5), Vec::new()).unwrap();
+        let variance = |k: &Keyframe| k.pose.covariance.matrix()[(0, 0)];
+        assert!((variance(&four) - 3.0 * variance(&one)).abs() < 1e-12);
+        assert_eq!(variance(&five), variance(&one));
+        assert_eq!(four.stamp.0 - one.stamp.0, 3_000_000_000);
+        assert!(slam.drive_nanos(four.stamp.as_secs_f64()).abs_diff(4_000_000_000) < 1000);
+    }
+
+    #[test]
+    fn a_restarted_slam_begins_at_the_identity() {
+        let mut slam = Slam::new(0.0);
+        slam.keyframe(&step(1), Vec::new()).unwrap();
+        slam.restart();
+        assert_eq!(slam.keyframe(&step(2), Vec::new()).unwrap().pose.pose, Se3::identity());
+        assert_eq!(slam.keyframe(&step(3), Vec::new()).unwrap().pose.pose.translation.x, 1.0);
+    }
 }
