@@ -147,9 +147,8 @@ impl Agent {
                 break;
             }
             let Candidate { mine, theirs, .. } = candidate;
-            if self.negotiation.features(mine).is_none() {
-                self.negotiation.mark_tried(pair_of(mine, theirs));
-            } else if self.start_alignment(mine, theirs, Purpose::Propose) {
+            // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
+            if self.negotiation.features(mine).is_none() || self.start_alignment(mine, theirs, Purpose::Propose) {
                 self.negotiation.mark_tried(pair_of(mine, theirs));
             }
         }
