@@ -3,7 +3,7 @@
 //!
 //! A recording is a folder:
 //! - `recording.toml`: a [`Manifest`].
-//! - `keyframes.csv`: a header line ([`KEYFRAMES_HEADER`]), then one [`KeyframeLine`] per keyframe with rising stamps:
+//! - `keyframes.csv`: a header line ([`KEYFRAMES_HEADER`]), then one line per keyframe with rising stamps:
 //!   `stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,…,c55,cloud` (21 numbers of the covariance's upper triangle, tangent order
 //!   (ρ, φ), local perturbation).
 //! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, one per keyframe.

@@ -101,7 +101,7 @@ fn ten_thousand_facts_of_strangers_are_counted_reported_once_and_forgotten() {
     let key = ed25519_dalek::SigningKey::from_bytes(&[99; 32]);
     let stranger = RobotId::of_key(&key.verifying_key().to_bytes());
     let roster = [(Name::new("stranger").unwrap(), key.verifying_key().to_bytes())];
-    let mut theirs = Replica::new(&swarm, roster.into_iter(), &common::config().gossip).unwrap();
+    let mut theirs = Replica::new(&swarm, roster, &common::config().gossip).unwrap();
     let verdict = Fact::Verdict(VerdictFact {
         alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: stranger, epoch: 1 }, seq: 0 },
         outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
