@@ -4,7 +4,7 @@
 
 use super::track::Track;
 use super::trajectory::{self, Corrected, TrajectoryError};
-use super::views::Views;
+use super::views::{Views, relation};
 use merganser_protocol::geometry::{PoseWithCovariance, Se3};
 use merganser_protocol::snapshot::PairStatus;
 use nalgebra::Vector6;
@@ -75,6 +75,22 @@ pub struct Pair {
     pub error: Option<PoseError>,
 }
 
+/// Errors of the single alignments between submaps that the joint estimate uses: whether their covariances are honest
+/// before anything is joined.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Singles {
+    /// Alignments whose truth is known.
+    pub count: usize,
+    /// Mean NEES; 6 if the covariances are honest.
+    pub nees_mean: f64,
+    /// Inside their 95 % ellipsoid.
+    pub inside_95: usize,
+    /// Root mean square error of the translation, m.
+    pub translation_rms_m: f64,
+    /// Root mean square error of the rotation, degrees.
+    pub rotation_rms_deg: f64,
+}
+
 /// Something that must be so.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Check {
@@ -93,6 +109,8 @@ pub struct Evaluation {
     pub pairs: Vec<Pair>,
     /// Every robot's path in the frame of the first robot, where merged.
     pub corrected: Vec<Option<Corrected>>,
+    /// The single alignments.
+    pub singles: Singles,
     /// The paths' errors, if all merged and all truths are known.
     pub trajectory: Option<TrajectoryError>,
     /// What must be so.
@@ -154,8 +172,9 @@ pub fn evaluate(tracks: &[Track], views: &[Views], bounds: &Bounds) -> Evaluatio
         None => Vec::new(),
     };
     let trajectory = trajectory::errors(tracks, &corrected);
+    let singles = singles(tracks, views);
     let checks = checks(tracks, views, &pairs, bounds);
-    Evaluation { pairs, corrected, trajectory, checks }
+    Evaluation { pairs, corrected, singles, trajectory, checks }
 }
 
 fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {
@@ -177,6 +196,35 @@ fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {
         });
     }
     pairs
+}
+
+/// Compares the alignments that the first robot uses with the truth.
+fn singles(tracks: &[Track], views: &[Views]) -> Singles {
+    let Some(reference) = views.first() else { return Singles::default() };
+    let t_world_anchor = |submap: &str| {
+        let (frame, _) = submap.rsplit_once('#')?;
+        let robot = views.iter().position(|views| views.frames.own == frame)?;
+        trajectory::true_anchor(tracks.get(robot)?, reference, submap)
+    };
+    let used = reference.graph.edges.iter().filter(|edge| edge.kind == "alignment" && edge.weight > 0.0);
+    let mut singles = Singles::default();
+    for edge in used {
+        let truth = t_world_anchor(&edge.i).zip(t_world_anchor(&edge.j));
+        let Some(((i, j), estimate)) = truth.zip(relation(&edge.t_i_j)) else { continue };
+        let error = PoseError::of(&estimate, &(i.inverse() * j));
+        singles.count += 1;
+        singles.nees_mean += error.nees;
+        singles.inside_95 += usize::from(error.inside_95());
+        singles.translation_rms_m += error.translation_m.powi(2);
+        singles.rotation_rms_deg += error.rotation_deg.powi(2);
+    }
+    let n = singles.count.max(1) as f64;
+    Singles {
+        nees_mean: singles.nees_mean / n,
+        translation_rms_m: (singles.translation_rms_m / n).sqrt(),
+        rotation_rms_deg: (singles.rotation_rms_deg / n).sqrt(),
+        ..singles
+    }
 }
 
 /// All pairs i < j.

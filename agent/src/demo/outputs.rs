@@ -112,6 +112,13 @@ fn alignments(result: &Outcome) -> Value {
         "reference_frame": result.views.first().map(|views| &views.frames.own),
         "chi2_6_95": CHI2_6_95,
         "pairs": result.evaluation.pairs.iter().map(pair).collect::<Vec<_>>(),
+        "single_alignments": {
+            "count": result.evaluation.singles.count,
+            "nees_mean": result.evaluation.singles.nees_mean,
+            "inside_95": result.evaluation.singles.inside_95,
+            "translation_rms_m": result.evaluation.singles.translation_rms_m,
+            "rotation_rms_deg": result.evaluation.singles.rotation_rms_deg,
+        },
         "checks": result.evaluation.checks.iter().map(|check| {
             json!({"what": check.what, "held": check.held, "found": check.found})
         }).collect::<Vec<_>>(),

@@ -1,6 +1,6 @@
 //! What the demonstration prints.
 
-use super::evaluate::{CHI2_6_95, Check, Evaluation, Pair};
+use super::evaluate::{CHI2_6_95, Check, Evaluation, Pair, Singles};
 use super::track::Track;
 use super::trajectory::TrajectoryError;
 use super::views::Views;
@@ -42,6 +42,14 @@ pub(super) fn evaluation(evaluation: &Evaluation, tracks: &[Track]) -> String {
         let _ = writeln!(
             text,
             "  {inside} of {all} errors lie inside their claimed 95 % ellipsoid (NEES ≤ {CHI2_6_95:.3})"
+        );
+    }
+    let Singles { count, nees_mean, inside_95, translation_rms_m, rotation_rms_deg } = evaluation.singles;
+    if count > 0 {
+        let _ = writeln!(
+            text,
+            "  Single alignments used: {count}, error {translation_rms_m:.3} m and {rotation_rms_deg:.2}° RMS, {inside_95} \
+             inside their 95 % ellipsoid, mean NEES {nees_mean:.1} (6 if honest)"
         );
     }
     if let Some(errors) = &evaluation.trajectory {

@@ -85,6 +85,9 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
             t_own_anchor: Some(relation(t_world(own).inverse() * track.truth.as_ref().unwrap()[first])),
         }
     };
+    // alpha/7#0 and beta/7#2
+    let first_of = |robot: usize, submap: usize| tracks[robot].truth.as_ref().unwrap()[submap * PER_SUBMAP];
+    let true_t_i_j = first_of(0, 0).inverse() * first_of(1, 2);
     let others = |robot: usize| (0..3).filter(move |i| *i != robot).map(|i| NAMES[i].to_owned()).collect::<Vec<_>>();
     Views {
         status: StatusView {
@@ -124,7 +127,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
                 kind: "alignment".into(),
                 i: "alpha/7#0".into(),
                 j: "beta/7#2".into(),
-                t_i_j: relation(Se3::identity()),
+                t_i_j: relation(true_t_i_j.retract(error)),
                 agreed: true,
                 weight: 1.0,
                 reason: String::new(),
@@ -193,6 +196,22 @@ fn a_true_map_passes_every_check() {
         assert!(truth.local(&corrected.poses[first]).norm() < 1e-9);
     }
     assert_eq!(corrected.anchors.len(), 3);
+}
+
+#[test]
+fn single_alignments_are_compared_with_the_anchors_truth() {
+    let tracks = tracks();
+    let singles = |x: f64| {
+        let error = Vector6::new(x, 0.0, 0.0, 0.0, 0.0, 0.0);
+        evaluate(&tracks, &all_views(&tracks, &error), &BOUNDS).singles
+    };
+    let per_square = covariance().mahalanobis_squared(&Vector6::x());
+    for (x, inside_95) in [(0.0, 1), (0.01, 1), (0.2, 0)] {
+        let singles = singles(x);
+        assert_eq!((singles.count, singles.inside_95), (1, inside_95), "{x}");
+        assert!((singles.nees_mean - per_square * x * x).abs() < 1e-6, "{x}: {}", singles.nees_mean);
+        assert!((singles.translation_rms_m - x).abs() < 1e-9 && singles.rotation_rms_deg < 1e-6, "{singles:?}");
+    }
 }
 
 #[test]

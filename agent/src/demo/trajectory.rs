@@ -37,6 +37,17 @@ pub fn correct(track: &Track, reference: &Views, frame: &str) -> Option<Correcte
     Some(Corrected { poses: poses.collect(), anchors })
 }
 
+/// True `t_world_anchor` of a submap, `name/epoch#index`: the anchor moves with the keyframe it was cut at.
+pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Se3> {
+    let (frame, index) = submap.rsplit_once('#')?;
+    let index: u32 = index.parse().ok()?;
+    let view = views.map.submaps.iter().find(|view| view.frame == frame && view.index == index)?;
+    let begins = |stamp: &f64| (stamp - view.stamps_secs[0]).abs() <= STAMP_SLACK_SECS;
+    let first = track.stamps_secs.iter().position(begins)?;
+    let t_body_anchor = track.odometry.get(first)?.inverse() * pose(&view.t_frame_anchor)?;
+    Some(*track.truth.as_ref()?.get(first)? * t_body_anchor)
+}
+
 /// Root mean square errors of keyframe positions, m.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectoryError {
