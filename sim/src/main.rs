@@ -195,7 +195,10 @@ fn line(report: &Report, wall: f64) -> String {
 }
 
 fn table(report: &Report) -> String {
-    let mut text = format!("\n{:<10} {:>8} {:>8} {:>8} {:>10}  merged with\n", "robot", "submaps", "facts", "pending", "bytes sent");
+    let mut text = format!(
+        "\n{:<10} {:>8} {:>8} {:>8} {:>10}  merged with\n",
+        "robot", "submaps", "facts", "pending", "bytes sent"
+    );
     for robot in &report.robots {
         text += &format!(
             "{:<10} {:>8} {:>8} {:>8} {:>10}  {}\n",
