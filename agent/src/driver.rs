@@ -2,7 +2,7 @@
 //! the next input. Time is what has passed since the process began; heavy jobs run on blocking threads and come back as
 //! inputs; everything that reaches the core is written to the journal first, if there is one.
 
-use crate::journal::{self, Frame, Replayed, StoredInput};
+use crate::journal::{self, Frame, StoredInput};
 use crate::queue::{Inbox, Outbox};
 use crate::store;
 use merganser_protocol::agent::Agent;
@@ -10,6 +10,7 @@ use merganser_protocol::agent::io::{AskToken, Channel, Event, Input, JobId, Outp
 use merganser_protocol::agent::job::Job;
 use merganser_protocol::ids::{Hash, RobotId};
 use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::submap::Keyframe;
 use merganser_protocol::time::Instant;
 use std::sync::Arc;
 use std::time::Duration;
@@ -229,15 +230,17 @@ impl<C: Core, N: Network> Driver<C, N> {
     /// both runs handle the same bits.
     fn journalled(&mut self, now: Instant, input: Input) -> Option<Input> {
         let stored = StoredInput::from(&input);
-        let input = match (&input, stored.clone().replayed()) {
-            (Input::Keyframe(_), Ok(Replayed::Input(same))) => same,
-            (Input::Keyframe(_), Err(reason)) => {
-                warn!(%reason, "keyframe refused: it cannot be written to the journal");
-                return None;
-            }
+        let input = match &stored {
+            StoredInput::Keyframe(message) => match Keyframe::try_from(message.clone()) {
+                Ok(keyframe) => Input::Keyframe(keyframe),
+                Err(reason) => {
+                    warn!(%reason, "keyframe refused: it cannot be written to the journal");
+                    return None;
+                }
+            },
             _ => input,
         };
-        self.write(&Frame::Input(now, stored));
+        self.write(&Frame::Input(now, Box::new(stored)));
         if now.since(self.journal_flushed) >= JOURNAL_FLUSH {
             self.journal_flushed = now;
             self.with_journal(journal::Writer::flush);

@@ -143,7 +143,7 @@ impl From<&Input> for StoredInput {
 #[derive(Debug)]
 pub enum Replayed {
     /// Hand it to the core.
-    Input(Input),
+    Input(Box<Input>),
     /// Run this job, then hand its result to the core.
     JobDone(JobId),
 }
@@ -154,7 +154,7 @@ impl StoredInput {
     /// # Errors
     /// [`ObservationError`] if a keyframe does not pass its checks: the journal was damaged.
     pub fn replayed(self) -> Result<Replayed, ObservationError> {
-        Ok(Replayed::Input(match self {
+        Ok(Replayed::Input(Box::new(match self {
             Self::Keyframe(message) => Input::Keyframe(message.try_into()?),
             Self::Sighting(sighting) => Input::Sighting(sighting),
             Self::Received(from, channel, bytes) => Input::Received { from, channel, bytes },
@@ -166,7 +166,7 @@ impl StoredInput {
             Self::JobDone(job) => return Ok(Replayed::JobDone(job)),
             Self::Timeout => Input::Timeout,
             Self::Command(command) => Input::Command(command),
-        }))
+        })))
     }
 }
 
@@ -176,7 +176,7 @@ pub enum Frame {
     /// The first.
     Start(Box<Start>),
     /// Something happened.
-    Input(Instant, StoredInput),
+    Input(Instant, Box<StoredInput>),
     /// The last of a run that ended in order, with the digest of its set of facts.
     End(Instant, Hash),
 }

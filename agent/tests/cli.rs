@@ -1,10 +1,12 @@
 //! The program from outside: its help and its exit codes.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 use std::path::Path;
 use std::process::{Command, Output};
 
 fn merganser(arguments: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_merganser")).args(arguments).current_dir(folder).output().unwrap()
+    let mut command = Command::new(env!("CARGO_BIN_EXE_merganser"));
+    command.args(arguments).current_dir(folder).env_remove("COLUMNS").output().unwrap()
 }
 
 fn text(bytes: &[u8]) -> String {

@@ -1,4 +1,5 @@
 //! Bad configurations get one clear error each: the file, the line, the key, and what to mend.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 use merganser::config::{FileConfig, FileConfigError};
 use merganser::trust::SecretKey;

@@ -1,5 +1,6 @@
 //! Agents on real Zenoh, over loopback: everything that one core says reaches the other as it was said, every question
 //! ends in one answer, floods are dropped and counted, and `…/in/*` is for this host alone.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod common;
 

@@ -1,4 +1,5 @@
 //! The program itself: `run` with a recording and a journal, ended by SIGTERM; `replay` of what it wrote; `watch` beside it.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod common;
 
@@ -62,7 +63,8 @@ fn run_is_fed_watched_ended_and_replayed() {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path();
     recording(&folder.join("walk"));
-    let endpoints = write_configs(folder, &["alpha"]);
+    let endpoints = write_configs(folder, &["alpha", "beta"]);
+    let other = spawn(&["run", "-c", "beta.toml"], folder); // a robot alone has nobody to send a beacon to
     let arguments = [
         "run",
         "-c",

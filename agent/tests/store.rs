@@ -1,4 +1,5 @@
 //! What was reported durable is there after a crash, whole batches or nothing; foreign stores are refused by name.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 use merganser::store::{Store, StoreError, Writer};
 use merganser_protocol::agent::io::{Input, Record};

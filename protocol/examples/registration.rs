@@ -4,10 +4,10 @@
 //!
 //! A `.corr` file is little-endian: `CORRv001`, u32 N, u32 outliers, f64 sigma, scale, R[9] row-major, t[3], then f32
 //! source[3N], f32 target[3N], u8 inlier[N]. Success is rotation < 5°, translation < 0.1, scale < 10 %; a refusal is a
-//! miss, a wrong acceptance is counted apart.
-#![allow(clippy::print_stdout, clippy::unwrap_used)]
+//! miss, a wrong answer is counted apart. `provisional` of the `ok` are above the accepting NFA of 1e-4.
+#![allow(clippy::print_stdout, clippy::unwrap_used, clippy::expect_used)]
 
-use merganser_protocol::align::{Model, Problem, Refusal, SolverConfig, align};
+use merganser_protocol::align::{Model, Problem, Refusal, SolverConfig, Standing, Weighting, align};
 use merganser_protocol::geometry::{Relative, Se3, Sim3, So3};
 use nalgebra::{Matrix3, Vector3};
 use std::collections::BTreeMap;
@@ -29,6 +29,8 @@ struct Cell {
     millis: Vec<f64>,
     distance: Vec<f64>,
     nfa: Vec<f64>,
+    provisional: usize,
+    wrong_accepted: usize,
     wrong: usize,
     ambiguous: usize,
     refused: usize,
@@ -113,8 +115,10 @@ fn run(case: &Case, config: &SolverConfig, cell: &mut Cell) {
             let scale = (sim.scale / case.truth.scale - 1.0).abs();
             if rotation > 5.0 || translation > 0.1 || scale > 0.1 {
                 cell.wrong += 1;
+                cell.wrong_accepted += usize::from(found.standing == Standing::Accepted);
                 return;
             }
+            cell.provisional += usize::from(found.standing == Standing::Provisional);
             cell.rotation.push(rotation);
             cell.over_oracle.extend(case.oracle.map(|o| rotation / o));
             cell.translation.push(translation);
@@ -123,7 +127,7 @@ fn run(case: &Case, config: &SolverConfig, cell: &mut Cell) {
             let d = distance(&found.t_target_source, &case.truth);
             cell.distance.push(d);
             cell.covered += usize::from(d < 1.0);
-            cell.kde += usize::from(found.weighting == merganser_protocol::align::Weighting::Kde);
+            cell.kde += usize::from(found.weighting == Weighting::Kde);
         }
         Err(Refusal::Ambiguous { .. }) => cell.ambiguous += 1,
         Err(_) => cell.refused += 1,
@@ -160,14 +164,16 @@ fn main() {
         }
     }
     println!(
-        "cell              ok wrong ambig none  rot_deg x_oracle trans   sigma  cover kde   nfa   ms_med   ms_max"
+        "cell              ok provisional wrong wrong_acc ambig none  rot_deg x_oracle trans   sigma  cover kde   nfa   ms_med   ms_max"
     );
     for (name, mut c) in cells {
         let ok = c.rotation.len();
         let max = c.millis.iter().copied().fold(0.0, f64::max);
         println!(
-            "{name:17} {ok:2} {:5} {:5} {:4} {:8.3} {:8.3} {:.4} {:.5} {:2}/{ok:2} {:3} {:6.1} {:8.2} {max:8.2}",
+            "{name:17} {ok:2} {:11} {:5} {:9} {:5} {:4} {:8.3} {:8.3} {:.4} {:.5} {:2}/{ok:2} {:3} {:6.1} {:8.2} {max:8.2}",
+            c.provisional,
             c.wrong,
+            c.wrong_accepted,
             c.ambiguous,
             c.refused,
             median(&mut c.rotation),

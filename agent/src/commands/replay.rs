@@ -76,7 +76,7 @@ pub fn replay(journal: &Path, identity: &Identity) -> Result<Outcome> {
                 now = at;
                 inputs += 1;
                 match input.replayed()? {
-                    Replayed::Input(input) => core.handle(now, input),
+                    Replayed::Input(input) => core.handle(now, *input),
                     Replayed::JobDone(job) => core.finish(now, job)?,
                 }
             }

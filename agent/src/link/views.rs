@@ -142,17 +142,15 @@ impl Server {
                 .drops()
                 .count(format!("not published, larger than zenoh.message_bytes_max: view/{view}"));
         }
-        if let Some(publisher) = self.publishers.get(view) {
-            if let Err(reason) = publisher.put(json.to_vec()).await {
-                tracing::debug!(%reason, view, "a view did not leave");
-            }
+        let Some(publisher) = self.publishers.get(view) else { return };
+        if let Err(reason) = publisher.put(json.to_vec()).await {
+            tracing::debug!(%reason, view, "a view did not leave");
         }
         self.published.insert(view, (now, json.to_vec()));
     }
 
     async fn views(&mut self) -> Option<Arc<Views>> {
-        if let Some((when, views)) = self.last.as_ref().filter(|(when, _)| when.elapsed() < FRESH) {
-            let _ = when;
+        if let Some((_, views)) = self.last.as_ref().filter(|(when, _)| when.elapsed() < FRESH) {
             return Some(views.clone());
         }
         let snapshot = self.snapshots.take().await?;

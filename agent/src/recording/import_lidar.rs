@@ -39,6 +39,10 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
         (read_poses(&graph)?, CloudFormat::XyzBin, source)
     } else {
         let source = |data: &Path, index| data.join(format!("{index:06}{SCAN_SUFFIX}"));
+        if !data.join(POSES).is_file() {
+            let why = format!("holds scans but neither {GRAPH} nor {POSES}; state the pose of each scan in {POSES}");
+            return Err(Problem::Data(why).of(data));
+        }
         (read_poses(&data.join(POSES))?, CloudFormat::KittiBin, source)
     };
     let scans: Vec<Scan> = poses

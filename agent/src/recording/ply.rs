@@ -211,7 +211,7 @@ mod tests {
                          end_header\n1 0.5 2 3\n2 -1 1e-3 4\n3 0 1 2\n";
 
     fn told(text: &str) -> (Option<usize>, String) {
-        let fault = parse(text.as_bytes()).err().expect("must be refused");
+        let fault = parse(text.as_bytes()).err().unwrap();
         (fault.line, fault.problem.to_string())
     }
 

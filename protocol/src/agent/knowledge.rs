@@ -1,6 +1,7 @@
 //! What the facts say, independent of the order they came in: the submaps, which alignments both endpoints agree on
 //! (the two-sided rule, DESIGN §3), and the estimation problem that follows from them.
 
+use super::distortion;
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
 use crate::geometry::Relative;
 use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
@@ -163,7 +164,7 @@ impl Knowledge {
         }
         frames.retain(|_, chain| !chain.odometry.is_empty());
         let held = |id: SubmapId| frames.get(&id.frame).is_some_and(|c| (id.index as usize) < c.odometry.len());
-        let alignments = self
+        let mut alignments: Vec<AgreedAlignment> = self
             .by_pair
             .iter()
             .filter(|((i, j), _)| held(*i) && held(*j))
@@ -171,6 +172,7 @@ impl Knowledge {
             .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
             .map(|(entry, fact)| AgreedAlignment { entry, i: fact.i, j: fact.j, t_i_j: self.measurement(entry, fact) })
             .collect();
+        distortion::charge(&mut alignments, &frames);
         let sightings = self
             .sightings
             .iter()

@@ -7,6 +7,7 @@
 //! published, counted in the have-vector, used in the estimate) when [`Input::Persisted`] confirms it.
 
 mod aligning;
+mod distortion;
 mod gossip;
 pub mod io;
 pub mod job;

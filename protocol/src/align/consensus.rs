@@ -75,7 +75,7 @@ impl<'a> Search<'a> {
             candidates: Vec::new(),
             refine: refine::Scratch::default(),
             accept: accept::Scratch::default(),
-            refused: Significance { log10_nfa: f64::INFINITY, count: 0 },
+            refused: Significance { log10_nfa: libm::log10(matches.len().max(1) as f64), count: 0 },
             refused_support: 0.0,
             degenerate: None,
         }

@@ -15,6 +15,8 @@ use nalgebra::Vector3;
 
 /// Edges whose common neighbours are counted, at most, in all graphs of a step; beyond, an even selection.
 const EDGES_MAX: usize = 65_536;
+/// ...and in each of them at least.
+const EDGES_MIN: usize = 8_192;
 /// Edges expanded to triangles, in all graphs of a step.
 const EDGES_EXPANDED: usize = 256;
 /// ...and at least, in each of them.
@@ -75,9 +77,10 @@ struct Edge {
     j: u32,
 }
 
-/// Ordered by most common neighbours.
+/// Ordered by how surprising its common neighbours are in its graph.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Triangle {
+    surprise: Reverse<u32>,
     common: Reverse<u32>,
     vertices: [u32; 3],
 }
@@ -95,7 +98,7 @@ impl Sampler {
         let graphs = scale_steps(context.scale_range);
         for k in 0..graphs {
             self.graph.build(scale_step(context.scale_range, k, graphs), step.sigma);
-            self.rank_edges(EDGES_MAX / graphs, (EDGES_EXPANDED / graphs).max(EDGES_EXPANDED_MIN));
+            self.rank_edges((EDGES_MAX / graphs).max(EDGES_MIN), (EDGES_EXPANDED / graphs).max(EDGES_EXPANDED_MIN));
             self.expand_edges();
         }
         self.triangles.sort_unstable();
@@ -137,6 +140,7 @@ impl Sampler {
     /// Adds the best triangles of each ranked edge.
     fn expand_edges(&mut self) {
         let graph = &self.graph;
+        let expected = graph.count as f64 * graph.density().powi(3);
         for edge in &self.edges {
             let (i, j) = (edge.i as usize, edge.j as usize);
             self.common.clear();
@@ -146,7 +150,8 @@ impl Sampler {
                 let common: u32 = self.common.iter().zip(graph.row(k)).map(|(a, b)| (a & b).count_ones()).sum();
                 let mut vertices = [edge.i, edge.j, k as u32];
                 vertices.sort_unstable();
-                let triangle = Triangle { common: Reverse(common), vertices };
+                let surprise = Reverse(surprise(common, expected));
+                let triangle = Triangle { surprise, common: Reverse(common), vertices };
                 if self.triangles.len() - first < TRIANGLES_PER_EDGE {
                     self.triangles.push(triangle);
                 } else if let Some(worst) = self.triangles[first..].iter_mut().max()
@@ -164,8 +169,11 @@ impl Sampler {
         let (mut tried, mut best_raw, mut best) = (0, 0.0_f64, 0.0_f64);
         for t in 0..self.triangles.len() {
             let triangle = self.triangles[t];
-            if tried >= step.hypotheses_max || f64::from(triangle.common.0) < COMMON_SHARE * best - 3.0 {
+            if tried >= step.hypotheses_max {
                 break;
+            }
+            if f64::from(triangle.common.0) < COMMON_SHARE * best - 3.0 {
+                continue;
             }
             let v = triangle.vertices.map(|k| k as usize);
             if self.explained.iter().any(|set| v.iter().all(|&k| set[k / 64] >> (k % 64) & 1 == 1)) {
@@ -243,6 +251,12 @@ impl Sampler {
     }
 }
 
+/// −1000 ln of the Poisson tail's leading term: how unlikely so many common neighbours are where `expected` are.
+fn surprise(common: u32, expected: f64) -> u32 {
+    let (count, expected) = (f64::from(common), expected.max(0.05));
+    if count > expected { (1000.0 * (count * libm::log(count / expected) - count + expected)) as u32 } else { 0 }
+}
+
 /// Graphs needed to cover a range of scales.
 fn scale_steps((low, high): (f64, f64)) -> usize {
     (libm::log(high / low) / libm::log(SCALE_STEP)).ceil().max(1.0) as usize
@@ -292,6 +306,13 @@ struct Graph {
 impl Graph {
     fn row(&self, i: usize) -> &[u64] {
         &self.rows[i * self.words..(i + 1) * self.words]
+    }
+
+    /// Share of pairs that are connected.
+    fn density(&self) -> f64 {
+        let n = self.count as f64;
+        let ends: usize = self.rows.iter().map(|w| w.count_ones() as usize).sum();
+        ends as f64 / (n * (n - 1.0)).max(1.0)
     }
 
     fn load(&mut self, context: &Context, pool: &[u32], sigma: f64) {

@@ -225,7 +225,8 @@ impl Block {
 fn stored(bytes: &[u8; POINT_LEN]) -> Option<Stored> {
     let [x0, x1, y0, y1, z0, z1, n0, n1, roughness, descriptor @ ..] = *bytes;
     let position = [i16::from_le_bytes([x0, x1]), i16::from_le_bytes([y0, y1]), i16::from_le_bytes([z0, z1])];
-    let good = position.iter().all(|&x| x != i16::MIN) && n0 != 255 && n1 != 255 && descriptor::is_canonical(&descriptor);
+    let good =
+        position.iter().all(|&x| x != i16::MIN) && n0 != 255 && n1 != 255 && descriptor::is_canonical(&descriptor);
     good.then_some(Stored { position, normal: [n0, n1], roughness, descriptor })
 }
 

@@ -108,15 +108,7 @@ struct Open {
 impl SubmapBuilder {
     /// A builder at the start of a new frame.
     pub fn new(config: SubmapConfig) -> Self {
-        Self {
-            config,
-            next_index: 0,
-            last: None,
-            since_finished: None,
-            resumed_at: None,
-            open: None,
-            gap: false,
-        }
+        Self { config, next_index: 0, last: None, since_finished: None, resumed_at: None, open: None, gap: false }
     }
 
     /// A builder that goes on after a restart of the agent (not of the SLAM): submaps below `next_index` exist, the
@@ -185,9 +177,8 @@ impl SubmapBuilder {
             return Err(KeyframeError::PointNotFinite { index });
         }
         let allowed = JUMP_SUBMAPS_MAX * self.config.distance_m;
-        let moved = self.last.as_ref().map_or(0.0, |last| {
-            (keyframe.pose.pose.translation - last.pose.pose.translation).norm()
-        });
+        let moved =
+            self.last.as_ref().map_or(0.0, |last| (keyframe.pose.pose.translation - last.pose.pose.translation).norm());
         if moved > allowed {
             return Err(KeyframeError::Jump { moved, allowed });
         }
@@ -219,7 +210,10 @@ impl SubmapBuilder {
                 stamps: [keyframe.stamp; 2],
                 odometry: self.since_finished.unwrap_or(first),
                 t_frame_anchor: keyframe.pose.pose,
-                t_anchor_body: PoseWithCovariance { pose: Se3::identity(), covariance: isotropic(ZERO_SIGMA, ZERO_SIGMA, &at_anchor) },
+                t_anchor_body: PoseWithCovariance {
+                    pose: Se3::identity(),
+                    covariance: isotropic(ZERO_SIGMA, ZERO_SIGMA, &at_anchor),
+                },
                 keyframes: Vec::new(),
                 cloud: Thinner::new(self.config.voxel_m, self.config.points_max),
             }
@@ -231,9 +225,10 @@ impl SubmapBuilder {
         let position = u16::try_from(open.keyframes.len()).unwrap_or(u16::MAX);
         open.keyframes.push(t_anchor_body);
         let rotation = t_anchor_body.rotation.matrix();
-        let points = keyframe.points.iter().map(|p| {
-            (rotation * Vector3::from(p.map(f64::from)) + t_anchor_body.translation).into()
-        });
+        let points = keyframe
+            .points
+            .iter()
+            .map(|p| (rotation * Vector3::from(p.map(f64::from)) + t_anchor_body.translation).into());
         open.cloud.add(points, position);
     }
 

@@ -1,0 +1,162 @@
+use super::super::testing::keyframe;
+use super::*;
+use crate::geometry::{Covariance, So3};
+use crate::submap::CovarianceOf;
+use nalgebra::Vector6;
+
+fn config() -> SubmapConfig {
+    SubmapConfig { voxel_m: 0.1, distance_m: 2.0, rotation_deg: 60.0, keyframes_max: 10, ..Default::default() }
+}
+
+fn at(x: f64) -> Se3 {
+    Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0))
+}
+
+/// Pushes keyframes at the given poses; returns which of them closed a submap, and the submaps.
+fn drive(builder: &mut SubmapBuilder, poses: &[Se3]) -> (Vec<usize>, Vec<Submap>) {
+    let push = |(k, pose): (usize, &Se3)| {
+        builder.push(keyframe(k as i64 + 1, *pose, &[Vector3::new(1.0, 0.0, 0.0)])).unwrap().map(|submap| (k, submap))
+    };
+    poses.iter().enumerate().filter_map(push).unzip()
+}
+
+#[test]
+fn a_submap_ends_at_each_limit_and_not_before() {
+    let along = |step: f64| (0..30).map(|k| at(f64::from(k) * step)).collect::<Vec<_>>();
+    // 0.01 short of the distance goes on; the distance itself ends it.
+    assert_eq!(drive(&mut SubmapBuilder::new(config()), &[at(0.0), at(1.99), at(2.0)]).0, vec![2]);
+    assert_eq!(drive(&mut SubmapBuilder::new(config()), &along(0.0)).0, vec![9, 19, 29]);
+    assert_eq!(drive(&mut SubmapBuilder::new(config()), &along(1.0)).0, vec![2, 5, 8, 11, 14, 17, 20, 23, 26, 29]);
+    let turned = |deg: f64| Se3::new(So3::exp(&Vector3::new(0.0, 0.0, deg.to_radians())), Vector3::zeros());
+    assert_eq!(drive(&mut SubmapBuilder::new(config()), &[turned(0.0), turned(59.9), turned(60.1)]).0, vec![2]);
+    let single = SubmapConfig { keyframes_max: 1, ..config() };
+    assert_eq!(drive(&mut SubmapBuilder::new(single), &along(0.0)[..3]).0, vec![0, 1, 2]);
+}
+
+#[test]
+fn anchors_chain_without_gaps_and_covariances_compound() {
+    let step = Se3::exp(&Vector6::new(0.5, 0.1, 0.0, 0.02, 0.0, 0.1));
+    let poses: Vec<Se3> = std::iter::successors(Some(at(3.0)), |p| Some(*p * step)).take(24).collect();
+    let mut builder = SubmapBuilder::new(config());
+    let (_, submaps) = drive(&mut builder, &poses);
+    assert!(submaps.len() >= 3);
+    assert_eq!(submaps[0].odometry.pose, poses[0]);
+    assert!((submaps[0].odometry.covariance.sigmas() - Vector6::repeat(FIRST_ANCHOR_SIGMA)).amax() < 1e-12);
+    let one = PoseWithCovariance { pose: step, covariance: Covariance::from_sigmas([0.01; 6]).unwrap() };
+    for (k, pair) in submaps.windows(2).enumerate() {
+        assert_eq!(pair[1].index as usize, k + 1);
+        let chained = pair[0].t_frame_anchor * pair[1].odometry.pose;
+        assert!(chained.local(&pair[1].t_frame_anchor).amax() < 1e-12);
+        // As many motions as keyframes in the first submap lie between the two anchors.
+        let expected = (1..pair[0].keyframes.len()).fold(one, |sum, _| sum.compose(&one));
+        let difference = pair[1].odometry.covariance.matrix() - expected.covariance.matrix();
+        assert!(difference.amax() < 1e-12, "{difference}");
+    }
+    let (index, t_anchor_body, stamp) = builder.body_since_anchor().unwrap();
+    let last = submaps.last().unwrap();
+    assert_eq!((index, stamp), (last.index, Stamp(24)));
+    assert!((last.t_frame_anchor * t_anchor_body.pose).local(&poses[23]).amax() < 1e-12);
+}
+
+#[test]
+fn flush_closes_what_is_open_once() {
+    let mut builder = SubmapBuilder::new(config());
+    assert!(builder.flush().is_none() && builder.body_since_anchor().is_none());
+    drive(&mut builder, &[at(0.0), at(0.5)]);
+    assert!(builder.body_since_anchor().is_none());
+    let submap = builder.flush().unwrap();
+    assert_eq!((submap.index, submap.stamps, submap.keyframes.len()), (0, [Stamp(1), Stamp(2)], 2));
+    // Two keyframes saw the body-fixed point at two places.
+    assert_eq!(submap.cloud, vec![[1.0, 0.0, 0.0], [1.5, 0.0, 0.0]]);
+    assert_eq!(submap.seen_from, vec![0, 1]);
+    assert!(builder.flush().is_none());
+    assert_eq!(builder.body_since_anchor().unwrap().1.pose, at(0.5));
+}
+
+#[test]
+fn a_restart_continues_the_numbering_and_admits_the_gap() {
+    let mut builder = SubmapBuilder::resume(config(), 7, Some(at(1.0)));
+    assert!(builder.body_since_anchor().is_none());
+    builder.push(keyframe(100, at(3.0), &[])).unwrap();
+    let (index, t_anchor_body, _) = builder.body_since_anchor().unwrap();
+    assert_eq!((index, t_anchor_body.pose), (6, at(2.0)));
+    assert!((t_anchor_body.covariance.sigmas()[0] - 0.1 * 2.1).abs() < 1e-12);
+    let submap = builder.flush().unwrap();
+    assert_eq!((submap.index, submap.odometry), (7, t_anchor_body));
+    // Nothing was finished before: as new.
+    let mut fresh = SubmapBuilder::resume(config(), 0, None);
+    fresh.push(keyframe(1, at(3.0), &[])).unwrap();
+    let first = fresh.flush().unwrap();
+    assert_eq!((first.index, first.odometry.pose), (0, at(3.0)));
+}
+
+#[test]
+fn bad_keyframes_are_refused_by_name_and_change_nothing() {
+    let mut builder = SubmapBuilder::new(config());
+    builder.push(keyframe(5, at(0.0), &[])).unwrap();
+    let refused = |builder: &mut SubmapBuilder, keyframe: Keyframe| builder.push(keyframe).unwrap_err();
+    for stamp in [5, 4, i64::MIN] {
+        assert_eq!(
+            refused(&mut builder, keyframe(stamp, at(0.1), &[])),
+            KeyframeError::StampNotRising { stamp, last: 5 }
+        );
+    }
+    for x in [f64::NAN, f64::INFINITY, -2e7] {
+        assert_eq!(refused(&mut builder, keyframe(6, at(x), &[])), KeyframeError::BadPosition);
+    }
+    for x in [f64::NAN, f64::NEG_INFINITY] {
+        let points = [Vector3::zeros(), Vector3::new(0.0, x, 0.0)];
+        assert_eq!(refused(&mut builder, keyframe(6, at(0.1), &points)), KeyframeError::PointNotFinite { index: 1 });
+    }
+    let crowd = vec![Vector3::zeros(); POINTS_PER_KEYFRAME_MAX + 1];
+    let too_many = KeyframeError::TooManyPoints { count: crowd.len() };
+    assert_eq!(refused(&mut builder, keyframe(6, at(0.1), &crowd)), too_many);
+    assert_eq!(refused(&mut builder, keyframe(6, at(20.1), &[])), KeyframeError::Jump { moved: 20.1, allowed: 20.0 });
+    builder.push(keyframe(6, at(0.2), &crowd[1..])).unwrap();
+    let submap = builder.flush().unwrap();
+    assert_eq!((submap.stamps, submap.cloud.len()), ([Stamp(5), Stamp(6)], 1));
+}
+
+#[test]
+fn a_refused_keyframe_widens_the_odometry_and_a_repeated_one_does_not() {
+    let sigma_after = |between: Option<Keyframe>| {
+        let mut builder = SubmapBuilder::new(SubmapConfig { keyframes_max: 1, ..config() });
+        builder.push(keyframe(1, at(0.0), &[])).unwrap();
+        if let Some(bad) = between {
+            builder.push(bad).unwrap_err();
+        }
+        builder.push(keyframe(3, at(1.0), &[])).unwrap().unwrap().odometry.covariance.sigmas()[0]
+    };
+    let clean = sigma_after(None);
+    assert!((clean - 0.01).abs() < 1e-9);
+    assert_eq!(sigma_after(Some(keyframe(1, at(0.0), &[]))), clean);
+    assert!(sigma_after(Some(keyframe(2, at(f64::NAN), &[]))) > 0.1);
+}
+
+#[test]
+fn pose_covariances_give_the_motion_by_subtraction_and_never_less_than_the_floor() {
+    let with = |stamp, x: f64, sigma: f64| {
+        let mut keyframe = keyframe(stamp, at(x), &[]);
+        keyframe.covariance_of = CovarianceOf::Pose;
+        keyframe.pose.covariance = Covariance::from_sigmas([sigma; 6]).unwrap();
+        keyframe
+    };
+    let odometry = |second: f64| {
+        let mut builder = SubmapBuilder::new(SubmapConfig { keyframes_max: 1, ..config() });
+        builder.push(with(1, 0.0, 0.03)).unwrap();
+        builder.push(with(2, 1.0, second)).unwrap().unwrap().odometry.covariance
+    };
+    // Along the motion no lever arm mixes in: √(0.05² − 0.03²).
+    assert!((odometry(0.05).sigmas()[0] - 0.04).abs() < 1e-9);
+    // A loop closure shrank the pose's covariance below the one before: the floor, 1 mm per metre.
+    assert!((odometry(0.02).sigmas()[0] - 1.1e-3).abs() < 1e-9);
+}
+
+#[test]
+fn memory_is_bounded_by_points_max() {
+    let config = SubmapConfig { points_max: 500, keyframes_max: 3, ..config() };
+    let grid: Vec<_> = (0..4000).map(|k| Vector3::new(f64::from(k % 80), f64::from(k / 80), 0.0) * 0.2).collect();
+    let mut builder = SubmapBuilder::new(config);
+    let closed: Vec<_> = (1..=3).map(|k| builder.push(keyframe(k, at(0.0), &grid)).unwrap()).collect();
+    assert_eq!(closed[2].as_ref().unwrap().cloud.len(), 500);
+}

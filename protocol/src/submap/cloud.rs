@@ -73,7 +73,12 @@ pub struct Normal {
 }
 
 /// The normal at `at` from its neighbours (nearest first, itself included), as seen from `viewpoint`.
-pub fn normal(points: &[Vector3<f64>], neighbours: &[Neighbour], at: &Vector3<f64>, viewpoint: &Vector3<f64>) -> Normal {
+pub fn normal(
+    points: &[Vector3<f64>],
+    neighbours: &[Neighbour],
+    at: &Vector3<f64>,
+    viewpoint: &Vector3<f64>,
+) -> Normal {
     let near = &neighbours[..neighbours.len().min(NORMAL_NEIGHBOURS_MAX)];
     let towards = viewpoint - at;
     let unknown = Normal { direction: towards.try_normalize(1e-9).unwrap_or_else(Vector3::z), roughness: None };
@@ -124,8 +129,9 @@ mod tests {
     #[test]
     fn a_flat_wall_and_a_single_place_are_searched_in_full() {
         for z in [0.0, 1.0] {
-            let wall: Vec<_> =
-                (0..3000).map(|k| Vector3::new(f64::from(k % 60) * 0.1 * z, f64::from(k / 60) * 0.1 * z, 0.3)).collect();
+            let wall: Vec<_> = (0..3000)
+                .map(|k| Vector3::new(f64::from(k % 60) * 0.1 * z, f64::from(k / 60) * 0.1 * z, 0.3))
+                .collect();
             let at = wall[1234];
             assert_eq!(Index::new(&wall).within(&at, 0.35), brute(&wall, &at, 0.35));
         }

@@ -2,13 +2,19 @@
 //! [`Features`] are all of them, kept privately by the owner. Both share one bounded layout; keypoints are the prefix
 //! of a priority order, so fewer are cut from more by keeping the first.
 
-use super::block::{Block, BlockError, Surfel};
+use super::block::{Block, BlockError, HEADER_LEN, POINT_LEN, Surfel};
 use super::descriptor::{self, DIMENSIONS};
+use nalgebra::Vector3;
 
 /// Keypoints in a blob at most.
 pub const KEYPOINTS_MAX: usize = 1024;
 /// Features of a submap at most.
 pub const FEATURES_MAX: usize = 1_000_000;
+
+/// Viewpoints kept with features at most (the first of the submap).
+pub const VIEWPOINTS_MAX: usize = 32;
+/// Stands for a viewpoint that was not kept.
+pub const UNSEEN: u8 = 255;
 
 const KEYPOINTS_MAGIC: [u8; 2] = *b"mk";
 const FEATURES_MAGIC: [u8; 2] = *b"mf";
@@ -17,9 +23,15 @@ const FEATURES_MAGIC: [u8; 2] = *b"mf";
 #[derive(Clone, Debug, PartialEq)]
 pub struct Keypoints(pub(super) Block);
 
-/// All described points of one's own submap, in the anchor frame.
+/// All described points of one's own submap, in the anchor frame, and from where they were seen.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Features(pub(super) Block);
+pub struct Features {
+    pub(super) block: Block,
+    /// Positions of the keyframes.
+    pub(super) viewpoints: Vec<[f32; 3]>,
+    /// For each point, the position in `viewpoints` of the keyframe that saw it first, or [`UNSEEN`].
+    pub(super) seen_from: Vec<u8>,
+}
 
 impl Keypoints {
     /// The blob: at most 18 + 26 × [`KEYPOINTS_MAX`] bytes.
@@ -45,9 +57,24 @@ impl Keypoints {
 }
 
 impl Features {
-    /// The features as a private disk record, 26 bytes a point.
+    /// Positions of the keyframes, in the anchor frame.
+    pub(super) fn viewpoints(&self) -> Vec<Vector3<f64>> {
+        self.viewpoints.iter().map(|p| Vector3::from(p.map(f64::from))).collect()
+    }
+
+    /// For each point, the position among the viewpoints of the one that saw it first, or [`UNSEEN`].
+    pub(super) fn seen_from(&self) -> &[u8] {
+        &self.seen_from
+    }
+
+    /// The features as a private disk record: viewpoints (12 bytes each, one byte for their number), one byte a point
+    /// that tells which saw it, then 26 bytes a point.
     pub fn encode(&self) -> Vec<u8> {
-        self.0.encode(FEATURES_MAGIC)
+        let mut bytes = self.block.encode(FEATURES_MAGIC);
+        bytes.extend(&self.seen_from);
+        self.viewpoints.iter().flatten().for_each(|x| bytes.extend(x.to_le_bytes()));
+        bytes.push(self.viewpoints.len() as u8);
+        bytes
     }
 
     /// Parses a record.
@@ -55,39 +82,124 @@ impl Features {
     /// # Errors
     /// [`BlockError`] if the bytes are not exactly what [`Features::encode`] writes.
     pub fn decode(bytes: &[u8]) -> Result<Self, BlockError> {
-        Block::decode(bytes, FEATURES_MAGIC, FEATURES_MAX).map(Self)
+        let cut = || BlockError::NoHeader { len: bytes.len() };
+        let (&count, rest) = bytes.split_last().ok_or_else(cut)?;
+        let count = usize::from(count);
+        let split = rest.len().checked_sub(12 * count).filter(|_| count <= VIEWPOINTS_MAX).ok_or_else(cut)?;
+        let (rest, viewpoints) = rest.split_at(split);
+        let viewpoints: Vec<[f32; 3]> = viewpoints
+            .as_chunks::<12>()
+            .0
+            .iter()
+            .map(|p| core::array::from_fn(|k| f32::from_le_bytes([p[4 * k], p[4 * k + 1], p[4 * k + 2], p[4 * k + 3]])))
+            .collect();
+        if viewpoints.iter().flatten().any(|x| !x.is_finite()) {
+            return Err(BlockError::BadScale);
+        }
+        // What remains is the block and one byte for each of its points.
+        let points = rest.len().saturating_sub(HEADER_LEN) / (POINT_LEN + 1);
+        let (block, seen_from) = rest.split_at(rest.len() - points);
+        let block = Block::decode(block, FEATURES_MAGIC, FEATURES_MAX)?;
+        let good = |&&seen: &&u8| seen == UNSEEN || usize::from(seen) < count;
+        match seen_from.iter().position(|seen| !good(&seen)) {
+            Some(index) => Err(BlockError::NotCanonical { index }),
+            None => Ok(Self { block, viewpoints, seen_from: seen_from.to_vec() }),
+        }
     }
 }
 
 macro_rules! described_points {
-    ($($kind:ty),*) => {$(
+    ($($kind:ty, $block:tt);*) => {$(
         impl $kind {
             /// Number of points.
             pub fn len(&self) -> usize {
-                self.0.points.len()
+                self.$block.points.len()
             }
 
             /// Whether there are none.
             pub fn is_empty(&self) -> bool {
-                self.0.points.is_empty()
+                self.$block.points.is_empty()
             }
 
             /// Edge of the voxel that the cloud was thinned to, frame units.
             pub fn voxel(&self) -> f64 {
-                self.0.voxel()
+                self.$block.voxel()
             }
 
             /// The points as pieces of surface.
             pub fn surfels(&self) -> Vec<Surfel> {
-                self.0.surfels()
+                self.$block.surfels()
             }
 
             /// The levels (0 to 15) of each point's descriptor.
             pub fn descriptors(&self) -> Vec<[u8; DIMENSIONS]> {
-                self.0.points.iter().map(|p| descriptor::unpack(&p.descriptor)).collect()
+                self.$block.points.iter().map(|p| descriptor::unpack(&p.descriptor)).collect()
             }
         }
     )*};
 }
 
-described_points!(Keypoints, Features);
+described_points!(Keypoints, 0; Features, block);
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{config, keyframe, room};
+    use super::super::{SubmapBuilder, describe};
+    use super::*;
+    use crate::geometry::{Se3, So3};
+    use proptest::prelude::*;
+
+    fn small() -> Features {
+        let mut builder = SubmapBuilder::new(config());
+        for k in 0..3 {
+            let pose = Se3::new(So3::identity(), Vector3::new(0.4 * f64::from(k), 0.0, 0.0));
+            let points: Vec<_> =
+                (0..12).map(|i| Vector3::new(0.1, f64::from(i % 4) * 0.1, f64::from(i / 4) * 0.1)).collect();
+            builder.push(keyframe(i64::from(k) + 1, pose, &points)).unwrap();
+        }
+        describe(&builder.flush().unwrap(), &config()).features
+    }
+
+    #[test]
+    fn a_record_holds_who_saw_what() {
+        let features = small();
+        assert_eq!(features.viewpoints.len(), 3);
+        assert!((0..3).all(|k| features.seen_from.contains(&k)));
+        assert_eq!(Features::decode(&features.encode()).unwrap(), features);
+        // Features and keypoints are told apart.
+        assert!(Keypoints::decode(&features.encode()).is_err());
+        assert!(Features::decode(&room(1).keypoints.encode()).is_err());
+    }
+
+    #[test]
+    fn every_truncation_extension_and_bad_viewpoint_is_refused() {
+        let features = small();
+        let bytes = features.encode();
+        for len in 0..bytes.len() {
+            assert!(Features::decode(&bytes[..len]).is_err(), "cut to {len}");
+        }
+        assert!(Features::decode(&[&bytes[..], &[3]].concat()).is_err());
+        let changed = |change: &dyn Fn(&mut Features)| {
+            let mut features = features.clone();
+            change(&mut features);
+            Features::decode(&features.encode())
+        };
+        assert!(changed(&|f| f.seen_from[1] = UNSEEN).is_ok());
+        assert_eq!(changed(&|f| f.seen_from[1] = 3), Err(BlockError::NotCanonical { index: 1 }));
+        assert_eq!(changed(&|f| f.viewpoints[0][2] = f32::NAN), Err(BlockError::BadScale));
+        assert!(changed(&|f| f.viewpoints.resize(VIEWPOINTS_MAX, [0.0; 3])).is_ok());
+        assert!(changed(&|f| f.viewpoints.resize(VIEWPOINTS_MAX + 1, [0.0; 3])).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn a_flipped_byte_is_refused_or_comes_back_the_same(at in any::<prop::sample::Index>(), with in any::<u8>()) {
+            let mut bytes = small().encode();
+            let at = at.index(bytes.len());
+            bytes[at] = with;
+            if let Ok(features) = Features::decode(&bytes) {
+                prop_assert_eq!(features.encode(), bytes);
+            }
+        }
+    }
+}

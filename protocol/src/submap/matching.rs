@@ -46,7 +46,8 @@ pub fn match_keypoints(theirs: &Keypoints, mine: &Features) -> Matches {
 pub fn fit(theirs: &Keypoints, mine: &Features, t_mine_theirs: &Sim3, radius: f64) -> f64 {
     let my_points: Vec<Vector3<f64>> = mine.surfels().iter().map(|s| s.position).collect();
     let index = Index::new(&my_points);
-    let hits = theirs.surfels().iter().filter(|s| index.nearest(&(*t_mine_theirs * s.position), radius).is_some()).count();
+    let hits =
+        theirs.surfels().iter().filter(|s| index.nearest(&(*t_mine_theirs * s.position), radius).is_some()).count();
     if theirs.is_empty() { 0.0 } else { hits as f64 / theirs.len() as f64 }
 }
 

@@ -1,11 +1,11 @@
 //! Keyframes become submaps; submaps become keypoints, descriptors and a summary; a peer's keypoints are matched with
 //! one's own features and an alignment is refined on them.
 //!
-//! The path of the data: [`SubmapBuilder`] cuts the stream of [`Keyframe`]s into [`Submap`]s; [`describe`] (heavy, a
+//! The path of the data: [`SubmapBuilder`] cuts the stream of [`Keyframe`]s into [`Submap`]s; [`describe()`] (heavy, a
 //! job) turns one into [`Features`] (complete, private), [`Keypoints`] (what a peer may fetch) and a [`Summary`] (what
 //! is gossiped). [`match_keypoints`] pairs a peer's few keypoints with all own features; once a solver made a pose of
-//! the pairs, [`fit`] says how much of the peer's submap it explains and [`refine`] sharpens it and states its
-//! covariance.
+//! the pairs, [`fit`] says how much of the peer's submap it explains and [`refine()`] sharpens it and states its
+//! covariance, unless it is degenerate or puts their points where mine saw nothing but air ([`contradiction`]).
 //!
 //! Lengths are in frame units (metres, unless the frame's scale is unknown). Everything here is a pure function of its
 //! arguments, equal to the bit on every machine.
@@ -21,7 +21,10 @@ mod odometry;
 pub mod refine;
 mod sampling;
 pub mod summary;
+#[cfg(test)]
+mod testing;
 mod thinning;
+mod visibility;
 
 pub use block::{BlockError, Surfel};
 pub use builder::{KeyframeError, Submap, SubmapBuilder};
@@ -30,6 +33,7 @@ pub use features::{Features, Keypoints};
 pub use matching::{Matches, fit, match_keypoints};
 pub use refine::{RefineConfig, RefineError, Refined, refine};
 pub use summary::{SUMMARY_LEN_MAX, Summary, SummaryError};
+pub use visibility::contradiction;
 
 use crate::geometry::PoseWithCovariance;
 use crate::time::Stamp;

@@ -67,7 +67,7 @@ impl Thinner {
         let mut key = [0; 3];
         for axis in 0..3 {
             let cell = (p[axis] / self.voxel).floor();
-            if !(cell.abs() < f64::from(VOXELS_PER_AXIS_MAX)) {
+            if cell.is_nan() || cell.abs() >= f64::from(VOXELS_PER_AXIS_MAX) {
                 return None;
             }
             key[axis] = cell as i32;

@@ -15,6 +15,7 @@ pub struct World {
 }
 
 const RANGE_MAX: f64 = 12.0;
+const VOXEL: f64 = 0.15;
 
 impl World {
     /// A furnished hall of 14 × 9 × 3 m.
@@ -26,7 +27,8 @@ impl World {
             let size = Vector3::new(rng.random_range(0.3..1.8), rng.random_range(0.3..1.2), rng.random_range(0.4..2.2));
             boxes.push([corner, corner + size]);
         }
-        let pillars = (0..5).map(|_| [rng.random_range(-6.0..6.0), rng.random_range(-4.0..4.0), rng.random_range(0.1..0.3)]);
+        let pillars =
+            (0..5).map(|_| [rng.random_range(-6.0..6.0), rng.random_range(-4.0..4.0), rng.random_range(0.1..0.3)]);
         Self { boxes, pillars: pillars.collect() }
     }
 
@@ -36,7 +38,8 @@ impl World {
     }
 
     fn is_free(&self, p: &Vector3<f64>) -> bool {
-        let inside = |b: &[Vector3<f64>; 2], margin: f64| (0..2).all(|k| p[k] > b[0][k] - margin && p[k] < b[1][k] + margin);
+        let inside =
+            |b: &[Vector3<f64>; 2], margin: f64| (0..2).all(|k| p[k] > b[0][k] - margin && p[k] < b[1][k] + margin);
         inside(&self.boxes[0], -0.4)
             && !self.boxes[1..].iter().any(|b| inside(b, 0.3))
             && !self.pillars.iter().any(|c| (p.x - c[0]).hypot(p.y - c[1]) < c[2] + 0.3)
@@ -77,7 +80,8 @@ impl World {
             let elevation = (f64::from(ring) * 2.0 - 31.0_f64).to_radians();
             for step in 0..360 {
                 let azimuth = (f64::from(step) + 0.5).to_radians();
-                let ray = Vector3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
+                let ray =
+                    Vector3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
                 if let Some(range) = self.cast(&t_world_body.translation, &(t_world_body.rotation * ray)) {
                     let p = ray * (range + noise * gaussian(rng));
                     points.push([p.x as f32, p.y as f32, p.z as f32]);
@@ -90,7 +94,8 @@ impl World {
     /// A submap of 5 scans along a short drive from a random free place (within `spread` of the world's middle).
     fn drive(&self, spread: [f64; 2], noise: f64, drift: f64, voxel: f64, rng: &mut ChaCha8Rng) -> Place {
         let (mut t_world_body, heading) = loop {
-            let at = Vector3::new(spread[0] * rng.random_range(-1.0..1.0), spread[1] * rng.random_range(-1.0..1.0), 1.0);
+            let at =
+                Vector3::new(spread[0] * rng.random_range(-1.0..1.0), spread[1] * rng.random_range(-1.0..1.0), 1.0);
             let yaw = rng.random_range(-3.1..3.1);
             let pose = Se3::new(So3::exp(&Vector3::new(0.0, 0.0, yaw)), at);
             let ahead = pose * Vector3::new(1.6, 0.0, 0.0);
@@ -113,8 +118,8 @@ impl World {
     /// Several submaps of this world.
     pub fn set(&self, name: &'static str, count: usize, spread: [f64; 2], drift: f64, seed: u64) -> Set {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let places = (0..count).map(|_| self.drive(spread, 0.02, drift, 0.1, &mut rng)).collect();
-        Set { name, config: config(0.1, 5), places, rotation_deg_max: 5.0, translation_max: 0.4 }
+        let places = (0..count).map(|_| self.drive(spread, 0.02, drift, VOXEL, &mut rng)).collect();
+        Set { name, places, rotation_deg_max: 5.0, translation_max: 0.4 }
     }
 }
 

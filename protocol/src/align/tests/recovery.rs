@@ -82,6 +82,38 @@ fn pure_outliers_are_never_accepted() {
 }
 
 #[test]
+fn pure_outliers_on_walls_floors_and_clusters_are_never_accepted() {
+    // Where points crowd, chance agreement is common; a uniform box would not know.
+    type Place = fn(&mut Draw) -> Vector3<f64>;
+    let walls: Place = |d| {
+        let mut p = d.in_cube().component_mul(&Vector3::new(1.0, 1.0, 0.3));
+        p[usize::from(d.unit() < 0.5)] = 0.0;
+        p
+    };
+    let flat: Place = |d| {
+        // Density falls with the square of the range, as a spinning LiDAR's does.
+        let (r, a) = (libm::pow(0.02, d.unit()), core::f64::consts::TAU * d.unit());
+        Vector3::new(r * libm::cos(a), r * libm::sin(a), 0.05 * d.unit())
+    };
+    let clusters: Place = |d| {
+        let c = (d.unit() * 5.0).floor();
+        Vector3::new(0.2 * c, (c * 0.37) % 1.0, (c * 0.61) % 1.0) + d.in_cube() * 0.1
+    };
+    for (label, place) in [("walls", walls), ("flat", flat), ("clusters", clusters)] {
+        for seed in 0..250 {
+            let mut draw = Draw::new(70_000 + seed);
+            let mut case = Case::uniform(seed, 0, 0, 1.0);
+            for _ in 0..120 {
+                let (p, q) = (place(&mut draw), place(&mut draw));
+                case.push(p, q);
+            }
+            let answer = case.solve(&config(3.0 * SIGMA));
+            assert!(answer.is_err(), "{label}, seed {seed}: {answer:?}");
+        }
+    }
+}
+
+#[test]
 fn two_equal_structures_are_ambiguous_and_a_minor_one_is_not() {
     for seed in 0..20 {
         for (n, major, minor) in [(100, 50, 50), (100, 15, 15), (400, 40, 36), (1000, 50, 50)] {

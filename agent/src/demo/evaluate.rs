@@ -1,0 +1,228 @@
+//! Is the merged map right, and does it know how right it is? Every frame alignment is compared with the truth of the
+//! recordings: error e = log(t_true⁻¹ t_estimated), and NEES = eᵀ Σ⁻¹ e with the covariance the robots state (of the local
+//! perturbation, MATH §1), which is χ²₆ if the covariance is honest. All functions here are pure.
+
+use super::track::Track;
+use super::trajectory::{self, Corrected, TrajectoryError};
+use super::views::Views;
+use merganser_protocol::geometry::{PoseWithCovariance, Se3};
+use merganser_protocol::snapshot::PairStatus;
+use nalgebra::Vector6;
+
+/// χ²₆ at 95 %: one honest error in twenty lies outside.
+pub const CHI2_6_95: f64 = 12.591_587_243_743_977;
+/// χ²₆ at 99.9 %: an error outside is no accident.
+pub const CHI2_6_999: f64 = 22.457_744_484_825_33;
+/// Estimates of different robots may differ by this, m and rad.
+const SAME: f64 = 1e-6;
+
+/// How large the error of a frame alignment may be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bounds {
+    /// Translation, m.
+    pub translation_m: f64,
+    /// Rotation, degrees.
+    pub rotation_deg: f64,
+}
+
+/// An estimate's error.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseError {
+    /// log(t_true⁻¹ t_estimated), (ρ, φ).
+    pub xi: Vector6<f64>,
+    /// Length of the difference of the translations, m.
+    pub translation_m: f64,
+    /// Angle between the rotations, degrees.
+    pub rotation_deg: f64,
+    /// ξᵀ Σ⁻¹ ξ.
+    pub nees: f64,
+}
+
+impl PoseError {
+    /// The error of `estimate` (Σ of the local perturbation) against `truth`.
+    pub fn of(estimate: &PoseWithCovariance, truth: &Se3) -> Self {
+        let xi = truth.local(&estimate.pose);
+        Self {
+            xi,
+            translation_m: (estimate.pose.translation - truth.translation).norm(),
+            rotation_deg: (truth.rotation.inverse() * estimate.pose.rotation).angle().to_degrees(),
+            nees: estimate.covariance.mahalanobis_squared(&xi),
+        }
+    }
+
+    /// Whether the truth lies inside the claimed 95 % ellipsoid.
+    pub fn inside_95(&self) -> bool {
+        self.nees <= CHI2_6_95
+    }
+}
+
+/// What became of a pair of robots.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pair {
+    /// The robots, in order.
+    pub robots: [String; 2],
+    /// Merged or why not; `None` if no alignment is known.
+    pub status: Option<PairStatus>,
+    /// Alignments proposed, agreed, used.
+    pub alignments: [u64; 3],
+    /// log₁₀ of the number of false alarms.
+    pub log10_nfa: Option<f64>,
+    /// `t_a_b`.
+    pub t_a_b: Option<PoseWithCovariance>,
+    /// True `t_a_b`.
+    pub truth: Option<Se3>,
+    /// Their difference.
+    pub error: Option<PoseError>,
+}
+
+/// Something that must be so.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Check {
+    /// What must be so.
+    pub what: String,
+    /// Whether it is.
+    pub held: bool,
+    /// How it is; in particular what is missing.
+    pub found: String,
+}
+
+/// The whole verdict.
+#[derive(Clone, Debug)]
+pub struct Evaluation {
+    /// Every pair of robots.
+    pub pairs: Vec<Pair>,
+    /// Every robot's path in the frame of the first robot, where merged.
+    pub corrected: Vec<Option<Corrected>>,
+    /// The paths' errors, if all merged and all truths are known.
+    pub trajectory: Option<TrajectoryError>,
+    /// What must be so.
+    pub checks: Vec<Check>,
+}
+
+impl Evaluation {
+    /// Whether every check held.
+    pub fn held(&self) -> bool {
+        self.checks.iter().all(|check| check.held)
+    }
+}
+
+/// What is still missing before the robots can be said to be done, a line each; empty when they are.
+pub fn missing(tracks: &[Track], statuses: &[Option<&merganser_protocol::snapshot::StatusView>]) -> Vec<String> {
+    let mut lines = Vec::new();
+    for (track, status) in tracks.iter().zip(statuses) {
+        let name = &track.name;
+        let Some(status) = status else {
+            lines.push(format!("{name} does not answer"));
+            continue;
+        };
+        if status.keyframes != track.odometry.len() as u64 {
+            lines.push(format!("{name} has taken {} of {} keyframes", status.keyframes, track.odometry.len()));
+        }
+        let apart: Vec<&str> =
+            others(tracks, name).filter(|other| !status.merged_with.iter().any(|m| m == other)).collect();
+        if !apart.is_empty() {
+            lines.push(format!("{name} has not merged with {}", apart.join(" and ")));
+        }
+        if !status.idle {
+            lines.push(format!("{name} still works ({} pending)", status.pending));
+        }
+        if status.receive_only {
+            lines.push(format!("{name} cannot write its store"));
+        }
+    }
+    let mut digests: Vec<&str> = statuses.iter().flatten().map(|status| status.digest.as_str()).collect();
+    digests.dedup();
+    if digests.len() > 1 {
+        lines.push("the robots do not hold the same facts yet".into());
+    }
+    lines
+}
+
+fn others<'a>(tracks: &'a [Track], name: &'a str) -> impl Iterator<Item = &'a str> {
+    tracks.iter().map(|track| track.name.as_str()).filter(move |other| *other != name)
+}
+
+/// Judges the views of all robots (in the order of `tracks`) against the truth.
+pub fn evaluate(tracks: &[Track], views: &[Views], bounds: &Bounds) -> Evaluation {
+    let pairs = pairs(tracks, views);
+    let corrected: Vec<Option<Corrected>> = match views.first() {
+        Some(reference) => tracks
+            .iter()
+            .zip(views)
+            .map(|(track, own)| trajectory::correct(track, reference, &own.frames.own))
+            .collect(),
+        None => Vec::new(),
+    };
+    let trajectory = trajectory::errors(tracks, &corrected);
+    let checks = checks(tracks, views, &pairs, bounds);
+    Evaluation { pairs, corrected, trajectory, checks }
+}
+
+fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {
+    let mut pairs = Vec::new();
+    for (i, j) in indices(tracks.len()) {
+        let found = views[0].pair(&views[i].frames.own, &views[j].frames.own);
+        let (a, b) = (&tracks[i], &tracks[j]);
+        let truth = a.t_world_frame().zip(b.t_world_frame()).map(|(a, b)| a.inverse() * b);
+        let t_a_b = found.and_then(|(_, t)| t);
+        let view = found.map(|(view, _)| view);
+        pairs.push(Pair {
+            robots: [a.name.clone(), b.name.clone()],
+            status: view.map(|view| view.status),
+            alignments: view.map_or([0; 3], |view| [view.proposed, view.agreed, view.used]),
+            log10_nfa: view.and_then(|view| view.log10_nfa),
+            t_a_b,
+            truth,
+            error: t_a_b.zip(truth).map(|(estimate, truth)| PoseError::of(&estimate, &truth)),
+        });
+    }
+    pairs
+}
+
+/// All pairs i < j.
+fn indices(n: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..n).flat_map(move |i| (i + 1..n).map(move |j| (i, j)))
+}
+
+fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: &Bounds) -> Vec<Check> {
+    let check = |what: &str, held, found: String| Check { what: what.into(), held, found };
+    let statuses: Vec<_> = views.iter().map(|views| Some(&views.status)).collect();
+    let missing = missing(tracks, &statuses);
+    let mut checks =
+        vec![check("all robots are fed, merged and idle, with the same facts", missing.is_empty(), missing.join("; "))];
+    let difference = difference(views);
+    let found = difference.map_or("an estimate is absent".into(), |d| format!("{d:.1e} apart"));
+    checks.push(check("all robots hold the same estimate", difference.is_some_and(|d| d <= SAME), found));
+    if pairs.iter().all(|pair| pair.truth.is_none()) {
+        return checks;
+    }
+    for pair in pairs {
+        let [a, b] = &pair.robots;
+        let Bounds { translation_m, rotation_deg } = bounds;
+        let what =
+            format!("{a}–{b}: error at most {translation_m} m and {rotation_deg}°, and inside the 99.9 % ellipsoid");
+        let (held, found) = match &pair.error {
+            None => (false, "no alignment of the frames, or no truth".into()),
+            Some(e) => (
+                e.translation_m <= *translation_m && e.rotation_deg <= *rotation_deg && e.nees <= CHI2_6_999,
+                format!("{:.3} m, {:.2}°, NEES {:.1}", e.translation_m, e.rotation_deg, e.nees),
+            ),
+        };
+        checks.push(Check { what, held, found });
+    }
+    checks
+}
+
+/// Largest difference between what the robots estimate of any pair of frames, m or rad; `None` if one of them estimates
+/// nothing.
+fn difference(views: &[Views]) -> Option<f64> {
+    let mut largest = 0.0_f64;
+    for (i, j) in indices(views.len()) {
+        let estimate = |robot: &Views| robot.pair(&views[i].frames.own, &views[j].frames.own)?.1;
+        let first = estimate(&views[0])?;
+        for robot in views {
+            largest = largest.max(first.pose.local(&estimate(robot)?.pose).amax());
+        }
+    }
+    Some(largest)
+}

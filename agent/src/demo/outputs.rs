@@ -1,0 +1,145 @@
+//! The files that the demonstration leaves: the merged map, the robots' paths, the alignments and the picture.
+
+use super::evaluate::{CHI2_6_95, Evaluation, Pair};
+use super::scene;
+use super::track::Track;
+use super::trajectory::Corrected;
+use super::views::Views;
+use crate::picture;
+use crate::recording::{Recording, ply};
+use anyhow::{Context, Result};
+use merganser_protocol::geometry::{PoseWithCovariance, Se3};
+use nalgebra::Vector3;
+use serde_json::{Value, json};
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// The merged map is thinned to one point per robot in cubes of this share of the submaps' voxel.
+const THIN: f64 = 0.5;
+/// Robots' colours, told apart by colour-blind people too (Okabe and Ito).
+pub(super) const COLOURS: [[u8; 3]; 6] =
+    [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [230, 159, 0], [86, 180, 233]];
+
+/// What everything is drawn and written from.
+pub(super) struct Outcome<'a> {
+    pub recordings: &'a [Recording],
+    pub tracks: &'a [Track],
+    pub views: &'a [Views],
+    pub evaluation: &'a Evaluation,
+    /// One line for the picture.
+    pub headline: String,
+}
+
+/// A robot's thinned points: in its own frame by odometry, and in the common frame.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Cloud {
+    pub own: Vec<Vector3<f64>>,
+    pub common: Vec<Vector3<f64>>,
+}
+
+/// Writes all files into `folder` and returns their paths.
+pub(super) fn write(result: &Outcome, folder: &Path) -> Result<Vec<PathBuf>> {
+    let mut clouds = Vec::new();
+    for (recording, corrected) in result.recordings.iter().zip(&result.evaluation.corrected) {
+        clouds.push(cloud(recording, corrected.as_ref())?);
+    }
+    let mut written = Vec::new();
+    let mut put = |name: String, bytes: Vec<u8>| -> Result<()> {
+        let path = folder.join(name);
+        fs::write(&path, bytes).with_context(|| path.display().to_string())?;
+        written.push(path);
+        Ok(())
+    };
+    put("merged.ply".into(), merged_ply(&clouds))?;
+    for (track, corrected) in result.tracks.iter().zip(&result.evaluation.corrected) {
+        if let Some(corrected) = corrected {
+            put(format!("robot_{}.tum", track.name), tum(&track.stamps_secs, &corrected.poses).into())?;
+        }
+    }
+    put("alignments.json".into(), serde_json::to_vec_pretty(&alignments(result))?)?;
+    let svg = picture::draw(&scene::scene(result, &clouds));
+    put("merge.png".into(), picture::png(&svg, 1.0)?)?;
+    put("merge.svg".into(), svg.into())?;
+    Ok(written)
+}
+
+/// Reads all clouds of a recording, thinned.
+fn cloud(recording: &Recording, corrected: Option<&Corrected>) -> Result<Cloud> {
+    let cell = recording.manifest().config.submap.voxel_m * THIN;
+    let mut taken = BTreeSet::new();
+    let mut cloud = Cloud::default();
+    for (index, line) in recording.keyframes().iter().enumerate() {
+        let t_common_body = corrected.and_then(|corrected| corrected.poses.get(index));
+        for point in recording.points(index)? {
+            let p_body = Vector3::from(point.map(f64::from));
+            let p_own = line.pose.pose * p_body;
+            let place = t_common_body.map_or(p_own, |t| *t * p_body);
+            if taken.insert(<[i64; 3]>::from(place.map(|x| (x / cell).floor() as i64))) {
+                cloud.own.push(p_own);
+                if t_common_body.is_some() {
+                    cloud.common.push(place);
+                }
+            }
+        }
+    }
+    Ok(cloud)
+}
+
+fn merged_ply(clouds: &[Cloud]) -> Vec<u8> {
+    let mut points = Vec::new();
+    for (cloud, colour) in clouds.iter().zip(COLOURS.iter().cycle()) {
+        points.extend(cloud.common.iter().map(|p| (<[f32; 3]>::from(p.map(|x| x as f32)), *colour)));
+    }
+    ply::encode_coloured(points.len(), points.iter().map(|(point, colour)| (point, *colour)))
+}
+
+/// The TUM format: `stamp x y z qx qy qz qw`, a pose a line.
+fn tum(stamps_secs: &[f64], poses: &[Se3]) -> String {
+    let mut text = String::new();
+    for (stamp, pose) in stamps_secs.iter().zip(poses) {
+        let ([x, y, z], [qx, qy, qz, qw]) = (<[f64; 3]>::from(pose.translation), pose.rotation.xyzw());
+        let _ = writeln!(text, "{stamp:.9} {x:.6} {y:.6} {z:.6} {qx:.9} {qy:.9} {qz:.9} {qw:.9}");
+    }
+    text
+}
+
+fn alignments(result: &Outcome) -> Value {
+    json!({
+        "conventions": "t_a_b maps frame b into frame a; quaternions [x, y, z, w]; tangents and covariances in the order \
+                        (translation, rotation), of the local perturbation T exp(δ); m and rad",
+        "reference_frame": result.views.first().map(|views| &views.frames.own),
+        "chi2_6_95": CHI2_6_95,
+        "pairs": result.evaluation.pairs.iter().map(pair).collect::<Vec<_>>(),
+        "checks": result.evaluation.checks.iter().map(|check| {
+            json!({"what": check.what, "held": check.held, "found": check.found})
+        }).collect::<Vec<_>>(),
+    })
+}
+
+fn pair(pair: &Pair) -> Value {
+    let [proposed, agreed, used] = pair.alignments;
+    let pose = |t: &Se3| json!({"translation": <[f64; 3]>::from(t.translation), "rotation": t.rotation.xyzw()});
+    let estimate = |t: &PoseWithCovariance| {
+        let p = t.covariance.matrix();
+        let rows: Vec<Vec<f64>> = (0..6).map(|r| (0..6).map(|c| p[(r, c)]).collect()).collect();
+        json!({"pose": pose(&t.pose), "covariance": rows, "sigmas": t.covariance.sigmas().as_slice()})
+    };
+    json!({
+        "a": pair.robots[0],
+        "b": pair.robots[1],
+        "status": pair.status,
+        "alignments": {"proposed": proposed, "agreed": agreed, "used": used},
+        "log10_nfa": pair.log10_nfa,
+        "t_a_b": pair.t_a_b.as_ref().map(estimate),
+        "truth": pair.truth.as_ref().map(pose),
+        "error": pair.error.map(|e| json!({
+            "xi": e.xi.as_slice(),
+            "translation_m": e.translation_m,
+            "rotation_deg": e.rotation_deg,
+            "nees": e.nees,
+            "inside_95": e.inside_95(),
+        })),
+    })
+}

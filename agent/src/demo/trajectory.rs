@@ -1,0 +1,98 @@
+//! The robots' paths after merging, in one frame, and their errors.
+
+use super::track::Track;
+use super::views::{Views, pose, relation};
+use merganser_protocol::geometry::{PoseWithCovariance, Se3, So3};
+use nalgebra::{Matrix3, Vector3};
+
+/// A keyframe belongs to a submap if its stamp lies in the submap's span, widened by this (stamps travel as floats), s.
+const STAMP_SLACK_SECS: f64 = 1e-6;
+
+/// One robot's path in the frame of the reference robot.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Corrected {
+    /// `t_ref_body`, one per keyframe.
+    pub poses: Vec<Se3>,
+    /// `t_ref_anchor` of its submaps, in order.
+    pub anchors: Vec<PoseWithCovariance>,
+}
+
+/// Moves a robot's odometry along with its submaps: t_ref_body = t_ref_anchor ∘ t_frame_anchor⁻¹ ∘ t_frame_body with the
+/// anchor of the submap that the keyframe belongs to. `None` if the reference robot does not know where `frame` lies.
+pub fn correct(track: &Track, reference: &Views, frame: &str) -> Option<Corrected> {
+    let mut submaps: Vec<_> = reference.map.submaps.iter().filter(|submap| submap.frame == frame).collect();
+    submaps.sort_by_key(|submap| submap.index);
+    let mut moves = Vec::new();
+    let mut anchors = Vec::new();
+    for submap in submaps {
+        let t_ref_anchor = relation(submap.t_own_anchor.as_ref()?)?;
+        moves.push((submap.stamps_secs[0], t_ref_anchor.pose * pose(&submap.t_frame_anchor)?.inverse()));
+        anchors.push(t_ref_anchor);
+    }
+    let first = moves.first()?.1;
+    let poses = track.stamps_secs.iter().zip(&track.odometry).map(|(stamp, t_frame_body)| {
+        let begun = moves.iter().take_while(|(start, _)| *start <= stamp + STAMP_SLACK_SECS);
+        begun.last().map_or(first, |(_, t_ref_frame)| *t_ref_frame) * *t_frame_body
+    });
+    Some(Corrected { poses: poses.collect(), anchors })
+}
+
+/// Root mean square errors of keyframe positions, m.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrajectoryError {
+    /// Odometry alone, given the true start of each robot; per robot and of all.
+    pub alone_m: (Vec<f64>, f64),
+    /// Merged, given the true start of the first robot only.
+    pub merged_m: (Vec<f64>, f64),
+    /// Merged, after the one rigid motion of the whole swarm that fits best.
+    pub fitted_m: (Vec<f64>, f64),
+}
+
+/// The paths' errors; `None` unless every robot merged and every truth is known.
+pub fn errors(tracks: &[Track], corrected: &[Option<Corrected>]) -> Option<TrajectoryError> {
+    let t_world_ref = tracks.first()?.t_world_frame()?;
+    let (mut alone, mut merged, mut truths) = (Vec::new(), Vec::new(), Vec::new());
+    for (track, corrected) in tracks.iter().zip(corrected) {
+        let t_world_frame = track.t_world_frame()?;
+        alone.push(positions(track.odometry.iter().map(|pose| t_world_frame * *pose)));
+        merged.push(positions(corrected.as_ref()?.poses.iter().map(|pose| t_world_ref * *pose)));
+        truths.push(positions(track.truth.as_ref()?.iter().copied()));
+    }
+    let fit = fit(&merged.concat(), &truths.concat());
+    let fitted = merged.iter().map(|path| path.iter().map(|p| fit * *p).collect()).collect::<Vec<_>>();
+    Some(TrajectoryError {
+        alone_m: errors_of(&alone, &truths),
+        merged_m: errors_of(&merged, &truths),
+        fitted_m: errors_of(&fitted, &truths),
+    })
+}
+
+fn positions(poses: impl Iterator<Item = Se3>) -> Vec<Vector3<f64>> {
+    poses.map(|pose| pose.translation).collect()
+}
+
+fn errors_of(paths: &[Vec<Vector3<f64>>], truths: &[Vec<Vector3<f64>>]) -> (Vec<f64>, f64) {
+    let each = paths.iter().zip(truths).map(|(path, truth)| rms(path, truth)).collect();
+    (each, rms(&paths.concat(), &truths.concat()))
+}
+
+fn rms(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> f64 {
+    let sum: f64 = a.iter().zip(b).map(|(a, b)| (a - b).norm_squared()).sum();
+    (sum / a.len().max(1) as f64).sqrt()
+}
+
+/// The rigid motion T with the least Σ |T aᵢ − bᵢ|² (Kabsch).
+pub fn fit(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> Se3 {
+    let mean = |points: &[Vector3<f64>]| points.iter().sum::<Vector3<f64>>() / points.len().max(1) as f64;
+    let (centre_a, centre_b) = (mean(a), mean(b));
+    let h: Matrix3<f64> = a.iter().zip(b).map(|(a, b)| (b - centre_b) * (a - centre_a).transpose()).sum();
+    let svd = h.svd(true, true);
+    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else { return Se3::identity() };
+    let mut sign = Vector3::repeat(1.0);
+    // A reflection fits better where the points lie in a plane; turn its weakest axis round.
+    if (u * v_t).determinant() < 0.0 {
+        sign[svd.singular_values.imin()] = -1.0;
+    }
+    let rotation = So3::from_matrix(&(u * Matrix3::from_diagonal(&sign) * v_t));
+    Se3::new(rotation, centre_b - rotation * centre_a)
+}

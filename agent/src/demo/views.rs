@@ -1,0 +1,68 @@
+//! The views of one robot as they are read off Zenoh, and poses out of them.
+
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use merganser_protocol::snapshot::{
+    FramesView, GraphView, MapView, PairView, PoseView, RelationView, StatsView, StatusView,
+};
+use nalgebra::{Matrix6, Vector3};
+use serde::de::DeserializeOwned;
+use std::collections::BTreeMap;
+
+/// What one robot showed at one moment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Views {
+    /// Who and how.
+    pub status: StatusView,
+    /// Frames and pairs.
+    pub frames: FramesView,
+    /// Anchors.
+    pub map: MapView,
+    /// Alignments.
+    pub graph: GraphView,
+    /// Counters.
+    pub stats: StatsView,
+}
+
+impl Views {
+    /// From JSON documents by view name; `None` if one is absent or of another shape.
+    pub fn parse(documents: &BTreeMap<String, Vec<u8>>) -> Option<Self> {
+        fn view<T: DeserializeOwned>(documents: &BTreeMap<String, Vec<u8>>, name: &str) -> Option<T> {
+            serde_json::from_slice(documents.get(name)?).ok()
+        }
+        Some(Self {
+            status: view(documents, "status")?,
+            frames: view(documents, "frames")?,
+            map: view(documents, "map")?,
+            graph: view(documents, "graph")?,
+            stats: view(documents, "stats")?,
+        })
+    }
+
+    /// The pair of these two frames and its `t_a_b`, whichever way round the robot states it.
+    pub fn pair(&self, a: &str, b: &str) -> Option<(&PairView, Option<PoseWithCovariance>)> {
+        let stated = |a: &str, b: &str| self.frames.pairs.iter().find(|pair| pair.a == a && pair.b == b);
+        if let Some(pair) = stated(a, b) {
+            return Some((pair, pair.t_a_b.as_ref().and_then(relation)));
+        }
+        let pair = stated(b, a)?;
+        Some((pair, pair.t_a_b.as_ref().and_then(relation).map(|t| t.inverse())))
+    }
+}
+
+/// A rigid pose.
+pub fn pose(view: &PoseView) -> Option<Se3> {
+    Some(Se3::new(So3::from_xyzw(view.rotation)?, Vector3::from(view.translation)))
+}
+
+/// A rigid pose with its covariance; `None` for a similarity.
+pub fn relation(view: &RelationView) -> Option<PoseWithCovariance> {
+    if view.covariance.len() != 21 {
+        return None;
+    }
+    let mut m = Matrix6::zeros();
+    for ((row, column), value) in (0..6).flat_map(|r| (r..6).map(move |c| (r, c))).zip(&view.covariance) {
+        m[(row, column)] = *value;
+        m[(column, row)] = *value;
+    }
+    Some(PoseWithCovariance { pose: pose(&view.pose)?, covariance: Covariance::new(m).ok()? })
+}

@@ -1,0 +1,175 @@
+//! Looks at the swarm from outside, as any Zenoh subscriber could: asks for the robots' views until all are done, until
+//! nothing more will come, or until the time is over.
+
+use super::evaluate::missing;
+use super::swarm::Swarm;
+use super::track::Track;
+use super::views::Views;
+use crate::config::ZenohConfig;
+use crate::keys;
+use crate::link::session::{self, Role};
+use anyhow::{Context, Result, bail};
+use indicatif::{ProgressBar, ProgressStyle};
+use merganser_protocol::snapshot::StatusView;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+use zenoh::Session;
+use zenoh::qos::CongestionControl;
+
+/// Time between two looks.
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// How long a robot may take to answer.
+const ANSWER_WAIT: Duration = Duration::from_secs(1);
+/// Robots that are idle and unchanged for this long, but not merged, will not merge any more.
+const SETTLED: Duration = Duration::from_secs(5);
+/// Answers that may wait.
+const ANSWERS_MAX: usize = 256;
+
+/// How it ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Ending {
+    /// All robots are fed, merged and idle, with the same facts.
+    Done,
+    /// All are idle and nothing changes, but not all merged.
+    Settled,
+    /// The time is over.
+    TimedOut,
+}
+
+/// What was seen at the end.
+pub(super) struct Seen {
+    pub ending: Ending,
+    pub after: Duration,
+    /// In the order of the tracks.
+    pub views: Vec<Views>,
+}
+
+/// Looks on until the end; `timeout` counts from now.
+pub(super) async fn watch(swarm: &mut Swarm, tracks: &[Track], timeout: Duration) -> Result<Seen> {
+    let config = ZenohConfig { connect: swarm.endpoints.clone(), multicast: false, ..ZenohConfig::default() };
+    let session = session::open(&config, Role::Onlooker).await?;
+    let seen = look(&session, swarm, tracks, timeout).await;
+    session::close(&session, Duration::from_secs(1)).await;
+    seen
+}
+
+async fn look(session: &Session, swarm: &mut Swarm, tracks: &[Track], timeout: Duration) -> Result<Seen> {
+    let bar = progress_bar(tracks);
+    let start = Instant::now();
+    let mut settling = Settling::default();
+    let mut done_once = false;
+    let (ending, after) = loop {
+        swarm.all_run()?;
+        let statuses = statuses(session, swarm).await;
+        let statuses: Vec<_> = swarm.agents.iter().map(|agent| statuses.get(agent.name.as_str())).collect();
+        show(&bar, &statuses);
+        let done = missing(tracks, &statuses).is_empty();
+        // Answers of one look may be of different moments; twice in a row they are of the same state.
+        if done && done_once {
+            break (Ending::Done, start.elapsed());
+        }
+        done_once = done;
+        if settling.look(&statuses) {
+            break (Ending::Settled, start.elapsed());
+        }
+        if start.elapsed() > timeout {
+            break (Ending::TimedOut, start.elapsed());
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
+    };
+    bar.finish_and_clear();
+    let documents = ask(session, swarm, "view/*").await;
+    let mut views = Vec::new();
+    for agent in &swarm.agents {
+        let own = documents.get(agent.name.as_str()).and_then(Views::parse);
+        views.push(
+            own.with_context(|| format!("{} did not show its views; its log:\n{}", agent.name, agent.log_tail()))?,
+        );
+    }
+    Ok(Seen { ending, after, views })
+}
+
+async fn statuses(session: &Session, swarm: &Swarm) -> BTreeMap<String, StatusView> {
+    let documents = ask(session, swarm, "view/status").await;
+    let parse = |documents: BTreeMap<String, Vec<u8>>| serde_json::from_slice(documents.get("status")?).ok();
+    documents.into_iter().filter_map(|(robot, documents)| Some((robot, parse(documents)?))).collect()
+}
+
+/// Views of every robot that answers: JSON by robot and view.
+async fn ask(session: &Session, swarm: &Swarm, rest: &str) -> BTreeMap<String, BTreeMap<String, Vec<u8>>> {
+    let (sender, mut replies) = mpsc::channel(ANSWERS_MAX);
+    let question = session
+        .get(keys::of_all(&swarm.name, rest))
+        .congestion_control(CongestionControl::Drop)
+        .timeout(ANSWER_WAIT)
+        .callback(move |reply| {
+            let _ = sender.try_send(reply); // there are far fewer
+        });
+    let mut documents: BTreeMap<String, BTreeMap<String, Vec<u8>>> = BTreeMap::new();
+    if let Err(reason) = question.await {
+        tracing::debug!(%reason, "nobody was asked");
+        return documents;
+    }
+    while let Some(reply) = replies.recv().await {
+        let Ok(sample) = reply.result() else { continue };
+        if let Some((robot, rest)) = keys::split(sample.key_expr().as_str())
+            && let Some(view) = rest.strip_prefix("view/")
+        {
+            documents.entry(robot.to_string()).or_default().insert(view.into(), sample.payload().to_bytes().into());
+        }
+    }
+    documents
+}
+
+/// Whether everything has stood still for [`SETTLED`].
+#[derive(Default)]
+struct Settling {
+    last: Vec<StatusView>,
+    since: Option<Instant>,
+}
+
+impl Settling {
+    fn look(&mut self, statuses: &[Option<&StatusView>]) -> bool {
+        let now: Vec<StatusView> = statuses.iter().flatten().map(|status| (*status).clone()).collect();
+        let still = now.len() == statuses.len() && now == self.last && now.iter().all(|s| s.idle && s.submaps > 0);
+        self.last = now;
+        if !still {
+            self.since = None;
+            return false;
+        }
+        self.since.get_or_insert_with(Instant::now).elapsed() > SETTLED
+    }
+}
+
+/// Counts keyframes; hidden where nobody sees it.
+fn progress_bar(tracks: &[Track]) -> ProgressBar {
+    let total: usize = tracks.iter().map(|track| track.odometry.len()).sum();
+    let bar = ProgressBar::new(total as u64);
+    if let Ok(style) = ProgressStyle::with_template("{elapsed:>4} {bar:30.cyan/blue} {pos}/{len} keyframes  {msg}") {
+        bar.set_style(style);
+    }
+    bar.enable_steady_tick(Duration::from_millis(100));
+    bar
+}
+
+fn show(bar: &ProgressBar, statuses: &[Option<&StatusView>]) {
+    let known = || statuses.iter().flatten();
+    bar.set_position(known().map(|status| status.keyframes).sum());
+    let merged: usize = known().map(|status| status.merged_with.len()).sum::<usize>() / 2;
+    let pairs = statuses.len() * statuses.len().saturating_sub(1) / 2;
+    let submaps: u64 = known().map(|status| status.submaps).sum();
+    let pending: u64 = known().map(|status| status.pending).sum();
+    bar.set_message(format!("{submaps} submaps, {pending} pending, {merged}/{pairs} pairs merged"));
+}
+
+/// Completes when the demonstration is told to end.
+pub(super) async fn interrupted() -> Result<Seen> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut terminate = signal(SignalKind::terminate()).context("cannot listen for signals")?;
+    tokio::select! {
+        _ = tokio::signal::ctrl_c() => {}
+        _ = terminate.recv() => {}
+    }
+    bail!("interrupted")
+}

@@ -1,0 +1,64 @@
+use super::super::testing::room;
+use super::*;
+use proptest::prelude::*;
+
+#[test]
+fn a_summary_survives_the_wire_and_is_most_like_itself() {
+    let (a, b) = (room(1).summary, room(2).summary);
+    let bytes = a.encode();
+    assert!(bytes.len() <= SUMMARY_LEN_MAX);
+    assert_eq!(Summary::decode(&bytes).unwrap(), a);
+    assert_eq!(a.similarity(&a), 1.0);
+    assert_eq!(a.similarity(&b), b.similarity(&a));
+    assert!((0.0..1.0).contains(&a.similarity(&b)));
+}
+
+#[test]
+fn empty_submaps_and_other_scales_are_like_nothing() {
+    let a = room(1).summary;
+    let empty = Summary { voxel: a.voxel, words: [0; WORDS] };
+    assert_eq!((empty.similarity(&empty), empty.similarity(&a)), (0.0, 0.0));
+    let with_voxel = |factor: f32| {
+        let mut scaled = a.clone();
+        scaled.voxel *= factor;
+        scaled
+    };
+    assert!(a.similarity(&with_voxel(1.49)) > 0.0 && a.similarity(&with_voxel(1.0 / 1.49)) > 0.0);
+    assert!(a.similarity(&with_voxel(1.51)) == 0.0 && a.similarity(&with_voxel(1.0 / 1.51)) == 0.0);
+}
+
+#[test]
+fn each_kind_of_damage_is_named() {
+    let bytes = room(1).summary.encode();
+    for len in 0..bytes.len() {
+        assert!(Summary::decode(&bytes[..len]).is_err(), "cut to {len}");
+    }
+    let damaged = |at: usize, with: &[u8]| {
+        let mut bytes = bytes.clone();
+        bytes[at..at + with.len()].copy_from_slice(with);
+        Summary::decode(&bytes).unwrap_err()
+    };
+    assert_eq!(damaged(0, &[9]), SummaryError::UnknownLayout { version: 9, projections: PROJECTIONS as u8 });
+    for voxel in [f32::NAN, f32::INFINITY, 0.0, -0.1, 1e-5, 1e4] {
+        assert_eq!(damaged(2, &voxel.to_le_bytes()), SummaryError::NotCanonical, "voxel {voxel}");
+    }
+    assert_eq!(damaged(HEADER_LEN, &[7; WORDS]), SummaryError::NotCanonical);
+    let longer = [bytes.clone(), vec![0]].concat();
+    assert_eq!(Summary::decode(&longer), Err(SummaryError::WrongLength { len: LEN + 1 }));
+}
+
+proptest! {
+    #[test]
+    fn any_bytes_are_refused_or_come_back_the_same(mut bytes in prop::collection::vec(any::<u8>(), 0..2 * LEN), fix in any::<bool>()) {
+        if fix && bytes.len() >= HEADER_LEN {
+            bytes.resize(LEN, 3);
+            bytes[..2].copy_from_slice(&[VERSION, PROJECTIONS as u8]);
+            bytes[2..HEADER_LEN].copy_from_slice(&0.1f32.to_le_bytes());
+            bytes[HEADER_LEN] = 255;
+            prop_assert!(Summary::decode(&bytes).is_ok());
+        }
+        if let Ok(summary) = Summary::decode(&bytes) {
+            prop_assert_eq!(summary.encode(), bytes);
+        }
+    }
+}
