@@ -5,6 +5,9 @@
 //! variance of the whole walk, which is the odometry covariance to the next anchor. As that error is common to the
 //! `n` alignments of one submap, each is charged `n` times its variance: together they then claim no more than one
 //! measurement of the displaced cloud. (Exact for alignments dominated by the common error, conservative otherwise.)
+//!
+//! Of an alignment's own covariance, too, a share is common to all alignments of a submap: a depth camera bends every
+//! view of a place alike. It is charged in the same way.
 
 use crate::estimate::joint::{AgreedAlignment, FrameChain};
 use crate::geometry::{Covariance, Relative};
@@ -15,6 +18,10 @@ use std::collections::BTreeMap;
 /// Variance of a submap's mean displacement from its anchor, per variance of the walk to the next anchor.
 const SHARE_OF_WALK: f64 = 1.0 / 3.0;
 
+/// Share of an alignment's own variance that its submaps' other alignments have in common. *Measured*: with 0 the
+/// frames of the 7-Scenes thirds average a NEES of 8.6 for 6 degrees of freedom over 24 merges; a quarter suffices.
+const SHARE_IN_COMMON: f64 = 0.25;
+
 /// Adds the common errors of both submaps to every alignment's covariance.
 pub(super) fn charge(alignments: &mut [AgreedAlignment], frames: &BTreeMap<FrameId, FrameChain>) {
     let mut uses: BTreeMap<SubmapId, usize> = BTreeMap::new();
@@ -22,11 +29,14 @@ pub(super) fn charge(alignments: &mut [AgreedAlignment], frames: &BTreeMap<Frame
         *uses.entry(alignment.i).or_default() += 1;
         *uses.entry(alignment.j).or_default() += 1;
     }
+    let count = |id: &SubmapId| uses.get(id).copied().unwrap_or(1) as f64;
     let displacement = |id: &SubmapId| {
-        let count = uses.get(id).copied().unwrap_or(1) as f64;
-        frames.get(&id.frame).and_then(|chain| walk(chain, id.index as usize)).map(|w| w * (SHARE_OF_WALK * count))
+        let chain = frames.get(&id.frame)?;
+        walk(chain, id.index as usize).map(|w| w * (SHARE_OF_WALK * count(id)))
     };
     for alignment in alignments {
+        let others = 0.5 * (count(&alignment.i) + count(&alignment.j)) - 1.0;
+        scale(&mut alignment.t_i_j, 1.0 + SHARE_IN_COMMON * others);
         let of_i = displacement(&alignment.i).unwrap_or_else(Matrix6::zeros);
         let of_j = displacement(&alignment.j).unwrap_or_else(Matrix6::zeros);
         widen(&mut alignment.t_i_j, &of_i, &of_j);
@@ -38,6 +48,13 @@ pub(super) fn charge(alignments: &mut [AgreedAlignment], frames: &BTreeMap<Frame
 fn walk(chain: &FrameChain, index: usize) -> Option<Matrix6<f64>> {
     let step = chain.odometry.get(index + 1).or_else(|| chain.odometry.get(index).filter(|_| index > 0))?;
     Some(*step.covariance.matrix())
+}
+
+fn scale(t_i_j: &mut Relative, factor: f64) {
+    match t_i_j {
+        Relative::Metric(p) => p.covariance = p.covariance.scaled(factor),
+        Relative::Similarity(s) => s.covariance = s.covariance.scaled(factor),
+    }
 }
 
 /// `t_i_j` measured between displaced clouds: i's displacement acts through Ad(t_i_j⁻¹), j's directly.
