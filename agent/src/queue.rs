@@ -7,12 +7,15 @@ use merganser_protocol::ids::Name;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 use tokio::sync::mpsc;
 
 /// Bytes of waiting outside input at most.
 pub const QUEUED_BYTES_MAX: usize = 32 << 20;
 /// A single source may fill this part of the queue: one in so many.
 const SHARE: usize = 4;
+/// Time between two looks for room in bytes.
+const FEED_WAIT: Duration = Duration::from_millis(2);
 /// Different reasons counted at most; the rest counts as one.
 const REASONS_MAX: usize = 64;
 
@@ -96,6 +99,9 @@ impl Inbox {
     /// Waits for room, then puts an input of the robot's own into the queue. Returns false if the driver has ended.
     pub async fn feed(&self, input: Input) -> bool {
         let bytes = weight(&input);
+        while self.load.bytes.load(Relaxed) > QUEUED_BYTES_MAX / 2 {
+            tokio::time::sleep(FEED_WAIT).await; // what is large leaves room for others
+        }
         let of_source = self.load.of_source(&Source::Own);
         of_source.fetch_add(1, Relaxed);
         self.load.bytes.fetch_add(bytes, Relaxed);

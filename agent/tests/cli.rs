@@ -5,7 +5,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 fn merganser(arguments: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_merganser")).args(arguments).current_dir(folder).output().unwrap()
+    let mut command = Command::new(env!("CARGO_BIN_EXE_merganser"));
+    command.args(arguments).current_dir(folder).env_remove("COLUMNS").output().unwrap()
 }
 
 fn text(bytes: &[u8]) -> String {

@@ -248,7 +248,10 @@ fn draw(swarm: &Name, robots: &BTreeMap<Name, Seen>) -> String {
             merged,
         ]);
     }
-    let mut text = format!("swarm {swarm}: {}\n", if robots.is_empty() { "no robot answers" } else { "" });
+    if rows.len() == 1 {
+        return format!("swarm {swarm}: no robot answers\n");
+    }
+    let mut text = format!("swarm {swarm}\n");
     lay_out(&mut text, &rows);
     let mut pairs = BTreeMap::new();
     for pair in robots.values().flat_map(|seen| &seen.pairs) {

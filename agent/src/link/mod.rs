@@ -1,6 +1,6 @@
 //! Zenoh on one side, the core's inputs and outputs on the other. Callbacks only copy into our bounded queue and return,
 //! because an undrained handler blocks the whole link; what is sent leaves from a thread of its own, because sending may
-//! wait for a slow neighbour; every question ends in exactly one [`Input::Answered`].
+//! wait for a slow neighbour; every question ends in exactly one `Input::Answered`.
 
 mod hear;
 mod say;
@@ -56,7 +56,7 @@ struct Shared {
 pub struct Sender(std::sync::mpsc::SyncSender<Outgoing>, Arc<Shared>);
 
 impl Link {
-    /// Opens a session and the way out. Nothing is heard or served before [`Link::start`].
+    /// Opens a session and the way out. Nothing is heard or served before [`Opened::start`].
     ///
     /// # Errors
     /// [`LinkError`].

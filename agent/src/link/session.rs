@@ -81,7 +81,7 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
             "listen/endpoints",
             json!(if config.mode == Mode::Client || role == Role::Onlooker { &[] } else { config.listen.as_slice() }),
         ),
-        ("connect/endpoints", json!(config.connect)),
+        ("connect/endpoints", json!(others(config))),
         // A robot that is not there yet must not keep this one from starting.
         ("connect/timeout_ms", json!({"router": -1, "peer": -1, "client": 10_000})),
         ("connect/exit_on_failure", json!({"router": false, "peer": false, "client": true})),
@@ -103,6 +103,11 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
         })?;
     }
     Ok(settings)
+}
+
+/// The connect list without ourselves, so that all robots can share one list.
+fn others(config: &ZenohConfig) -> Vec<&String> {
+    config.connect.iter().filter(|endpoint| !config.listen.contains(endpoint)).collect()
 }
 
 /// Of two robots that find each other, one opens the link: with two links per pair, healthy neighbours of a lost robot
@@ -148,4 +153,21 @@ fn access(interfaces: &[String]) -> Value {
             {"rules": ["hear this host"], "subjects": ["this host"]},
         ],
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn zenoh_takes_all_settings_and_does_not_connect_to_itself() {
+        let mut config = ZenohConfig { listen: vec!["tcp/127.0.0.1:7001".into()], ..ZenohConfig::default() };
+        config.connect = vec!["tcp/127.0.0.1:7001".into(), "tcp/127.0.0.1:7002".into()];
+        for (mode, role) in [(Mode::Peer, Role::Robot), (Mode::Router, Role::Robot), (Mode::Client, Role::Robot)] {
+            let settings = settings(&ZenohConfig { mode, ..config.clone() }, role).unwrap();
+            let connect = settings.get_json("connect/endpoints").unwrap();
+            assert!(connect.contains("7002") && !connect.contains("7001"), "{connect}");
+            assert_eq!(settings.get_json("transport/link/rx/max_message_size").unwrap(), "1048576");
+        }
+    }
 }
