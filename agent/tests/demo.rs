@@ -1,4 +1,5 @@
 //! The demonstration as a program: it ends by itself, leaves nothing running, and says what is wrong with bad data.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 use std::path::Path;
 use std::process::{Command, Stdio};
