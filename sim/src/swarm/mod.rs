@@ -422,7 +422,9 @@ impl<C: Core> Swarm<C> {
         if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {
             self.violation.get_or_insert(violation);
         }
-        self.queue.push(now.after(millis(1000.0)), Event::Sample);
+        // A snapshot costs more the more robots there are, and there are as many of them.
+        let pause = (0.2 * self.robots.len() as f64).max(1.0);
+        self.queue.push(now.after(millis(1e3 * pause)), Event::Sample);
     }
 
     fn robot_samples(&mut self, now: Instant) -> Vec<RobotSample> {
