@@ -116,8 +116,7 @@ impl Agent {
     }
 
     fn start_verifying(&mut self) {
-        let owed: Vec<EntryId> = self.negotiation.verify.iter().copied().collect();
-        for id in owed {
+        for id in self.answers_owed() {
             let Some(fact) = self.knowledge.alignment(id).cloned() else {
                 self.negotiation.verify.remove(&id);
                 continue;
@@ -174,6 +173,9 @@ impl Agent {
     /// two submaps cannot touch, or where the two frames are tied together well enough.
     fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
         let (a, b) = pair_of(candidate.mine, candidate.theirs);
+        if self.is_out_of_reach(candidate.theirs) {
+            return None;
+        }
         if stated.get(&(a.frame, b.frame)).is_some_and(|&n| n >= ALIGNMENTS_PER_FRAME_PAIR) {
             return None;
         }
@@ -183,6 +185,20 @@ impl Agent {
             Some(distance) if distance <= self.reach(a) + self.reach(b) => Some(candidate.similarity + wish),
             Some(_) => None,
         }
+    }
+
+    /// Nobody in reach has the submap's keypoints.
+    fn is_out_of_reach(&self, id: SubmapId) -> bool {
+        self.knowledge.submap(id).is_some_and(|fact| self.negotiation.out_of_reach.contains(&fact.blob))
+    }
+
+    /// Alignments that wait for our answer and can be worked on now.
+    pub(super) fn answers_owed(&self) -> Vec<EntryId> {
+        let reachable = |id: &&EntryId| {
+            let fact = self.knowledge.alignment(**id);
+            fact.is_none_or(|fact| !self.is_out_of_reach(fact.i) && !self.is_out_of_reach(fact.j))
+        };
+        self.negotiation.verify.iter().filter(reachable).copied().collect()
     }
 
     /// Distance between two anchors by the joint estimate, if they are connected.
@@ -238,8 +254,8 @@ impl Agent {
     /// Stops fetching what no pair needs any more.
     fn drop_idle_fetches(&mut self) {
         let mut wanted: BTreeSet<SubmapId> = self.active_candidates().iter().map(|c| c.theirs).collect();
-        for id in &self.negotiation.verify {
-            wanted.extend(self.knowledge.alignment(*id).into_iter().flat_map(|fact| [fact.i, fact.j]));
+        for id in self.answers_owed() {
+            wanted.extend(self.knowledge.alignment(id).into_iter().flat_map(|fact| [fact.i, fact.j]));
         }
         let blobs: BTreeSet<Hash> =
             wanted.into_iter().filter_map(|id| self.knowledge.submap(id)).map(|fact| fact.blob).collect();

@@ -171,6 +171,8 @@ impl Agent {
             self.gossip.neighbours.remove(&robot);
         } else if self.gossip.neighbours.insert(robot) {
             self.gossip.next_have = self.now; // Contact: compare at once.
+            self.negotiation.out_of_reach.clear();
+            self.negotiation.stir();
         }
     }
 

@@ -39,6 +39,8 @@ pub struct Knowledge {
     by_pair: BTreeMap<Pair, BTreeSet<EntryId>>,
     verdicts: BTreeMap<EntryId, BTreeMap<EntryId, VerdictFact>>,
     sightings: BTreeMap<EntryId, SightingFact>,
+    /// Derived, kept because it is asked often: what [`Knowledge::judge`] says of each alignment.
+    agreements: BTreeMap<EntryId, Agreement>,
 }
 
 impl Knowledge {
@@ -49,7 +51,9 @@ impl Knowledge {
             Fact::Submap(submap) => self.absorb_submap(id, submap),
             Fact::Alignment(alignment) => self.absorb_alignment(id, alignment),
             Fact::Verdict(verdict) => {
-                self.verdicts.entry(verdict.alignment).or_default().insert(id, verdict);
+                let alignment = verdict.alignment;
+                self.verdicts.entry(alignment).or_default().insert(id, verdict);
+                self.agreements.insert(alignment, self.judge(alignment));
             }
             Fact::Sighting(sighting) => {
                 let known = sighting.i.frame.robot == id.frame.robot && sighting.j.frame.robot != id.frame.robot;
@@ -74,6 +78,7 @@ impl Knowledge {
         if endpoint && fact.i < fact.j {
             self.by_pair.entry((fact.i, fact.j)).or_default().insert(id);
             self.alignments.insert(id, fact);
+            self.agreements.insert(id, self.judge(id));
         }
     }
 
@@ -109,6 +114,10 @@ impl Knowledge {
 
     /// What the two endpoints make of an alignment.
     pub fn agreement(&self, id: EntryId) -> Agreement {
+        self.agreements.get(&id).copied().unwrap_or(Agreement::Waiting)
+    }
+
+    fn judge(&self, id: EntryId) -> Agreement {
         let Some(fact) = self.alignments.get(&id) else { return Agreement::Waiting };
         if fact.i.frame.robot == fact.j.frame.robot {
             return Agreement::Agreed;

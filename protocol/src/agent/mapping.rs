@@ -133,6 +133,7 @@ impl Agent {
         let hash = Hash::of(&bytes);
         match Keypoints::decode(&bytes) {
             Ok(keypoints) => {
+                self.negotiation.out_of_reach.remove(&hash);
                 self.negotiation.add_keypoints(hash, Arc::new(keypoints));
                 self.gossip.add_blob(hash, bytes);
             }

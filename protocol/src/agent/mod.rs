@@ -358,8 +358,8 @@ impl Agent {
         for (id, fact) in &facts {
             self.knowledge.absorb(*id, fact.clone());
         }
-        for (id, fact) in &facts {
-            self.on_fact(*id, fact);
+        for (id, fact) in facts.iter().filter(|(_, fact)| !matches!(fact, Fact::Verdict(_))) {
+            self.on_fact(*id, fact); // Verdicts call for nothing but news, and these are old.
         }
         self.map.dirty = true;
     }

@@ -30,6 +30,8 @@ pub const VERIFICATIONS_MAX: usize = 1_024;
 pub const TRIED_MAX: usize = 1_000_000;
 /// Blobs fetched at once.
 pub const FETCHES_MAX: usize = 4;
+/// Attempts after which a blob counts as out of reach, until a neighbour appears who may have it.
+pub const FETCH_ATTEMPTS_MAX: u32 = 6;
 /// Longest pause between two attempts to fetch one blob.
 pub const FETCH_BACKOFF_MAX: Duration = Duration::from_secs(30);
 
@@ -91,6 +93,8 @@ pub struct Negotiation {
     pub verify: BTreeSet<EntryId>,
     /// Blobs on their way.
     pub fetches: BTreeMap<Hash, Fetch>,
+    /// Blobs that nobody in reach has: pairs that need them wait without counting as work.
+    pub out_of_reach: BTreeSet<Hash>,
     /// Jobs under way.
     pub running: BTreeMap<JobId, Work>,
     /// Something changed that may make work startable.
@@ -219,8 +223,15 @@ impl Negotiation {
 
     /// Notes the outcome of a fetch attempt that failed at `now`.
     pub fn fetch_failed(&mut self, query: QueryId, now: Instant) {
-        if let Some(fetch) = self.fetches.values_mut().find(|fetch| fetch.query == Some(query)) {
+        let failed = self.fetches.iter_mut().find(|(_, fetch)| fetch.query == Some(query));
+        if let Some((&hash, fetch)) = failed {
             fetch.query = None;
+            if fetch.failures + 1 >= FETCH_ATTEMPTS_MAX {
+                self.fetches.remove(&hash);
+                self.out_of_reach.insert(hash);
+                self.stirred = true;
+                return;
+            }
             fetch.failures = fetch.failures.saturating_add(1);
             let backoff = Duration::from_millis(500) * 2u32.pow(fetch.failures.min(7));
             fetch.not_before = now.after(backoff.min(FETCH_BACKOFF_MAX));
@@ -279,19 +290,22 @@ mod tests {
     }
 
     #[test]
-    fn a_failing_fetch_backs_off_up_to_the_bound() {
+    fn a_failing_fetch_backs_off_and_is_given_up_at_the_bound() {
         let mut n = Negotiation::default();
         let (hash, query) = (Hash::of(b"x"), QueryId(7));
         n.fetches
             .insert(hash, Fetch { owner: RobotId([2; 8]), query: Some(query), failures: 0, not_before: Instant::ZERO });
         let mut last = Duration::ZERO;
-        for _ in 0..20 {
+        for _ in 1..FETCH_ATTEMPTS_MAX {
             n.fetches.get_mut(&hash).unwrap().query = Some(query);
             n.fetch_failed(query, Instant::ZERO);
             let pause = n.fetches[&hash].not_before.since(Instant::ZERO);
-            assert!(pause >= last && pause <= FETCH_BACKOFF_MAX);
+            assert!(pause > last && pause <= FETCH_BACKOFF_MAX);
             last = pause;
         }
-        assert_eq!(last, FETCH_BACKOFF_MAX);
+        assert!(!n.out_of_reach.contains(&hash));
+        n.fetches.get_mut(&hash).unwrap().query = Some(query);
+        n.fetch_failed(query, Instant::ZERO);
+        assert!(n.fetches.is_empty() && n.out_of_reach.contains(&hash));
     }
 }

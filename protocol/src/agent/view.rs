@@ -50,7 +50,7 @@ impl Agent {
     /// Work that this robot still has to do with the facts it holds.
     fn pending(&self) -> u64 {
         let writing = self.ledger.waiting.len() + self.ledger.open.len();
-        let aligning = self.negotiation.running.len() + self.negotiation.verify.len() + self.active_candidates().len();
+        let aligning = self.negotiation.running.len() + self.answers_owed().len() + self.active_candidates().len();
         (writing + aligning + self.mapper.pending()) as u64
     }
 
