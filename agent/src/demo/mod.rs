@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use swarm::Swarm;
 use track::Track;
-use watch::{Ending, Seen};
+use watch::{Ending, Interrupts, Seen};
 
 /// Folder, inside the output folder, of what the agents need while they run.
 const WORK: &str = "work";
@@ -118,6 +118,8 @@ struct Played {
 }
 
 async fn play(args: &DemoArgs, recordings: &[Recording], tracks: &[Track], work: &Path) -> Result<Played> {
+    // Before there is an agent that could be left behind.
+    let mut interrupts = Interrupts::catch()?;
     let mut swarm = Swarm::start(recordings, &work.join("robots"), args.speed, args.seed)?;
     if let Some(endpoint) = swarm.endpoints.first() {
         say(&format!("Look on meanwhile: merganser watch --no-multicast --connect {endpoint}\n"))?;
@@ -127,7 +129,7 @@ async fn play(args: &DemoArgs, recordings: &[Recording], tracks: &[Track], work:
     let timeout = Duration::try_from_secs_f64(timeout).context("--timeout")?;
     let seen = tokio::select! {
         seen = watch::watch(&mut swarm, tracks, timeout) => seen?,
-        told = watch::interrupted() => told?,
+        told = interrupts.wait() => told?,
     };
     let memory = swarm.agents.iter().map(swarm::Agent::memory).collect();
     let tails = swarm.agents.iter().map(|agent| format!("{}: {}\n", agent.name, agent.log_tail())).collect();

@@ -328,7 +328,9 @@ fn views_are_read_from_json_and_bad_ones_are_not() {
     // JSON numbers may differ in their last digit.
     assert!(t(&parsed).pose.local(&t(&views).pose).norm() < 1e-12);
     documents.insert("map".into(), b"null".to_vec());
-    assert!(Views::parse(&documents).is_none());
+    assert!(Views::parse(&documents).unwrap_err().starts_with("view/map is of another shape"));
+    documents.remove("status");
+    assert_eq!(Views::parse(&documents).unwrap_err(), "view/status did not come");
 }
 
 /// Recordings of the tracks in `folder`, each keyframe seeing points of one room.

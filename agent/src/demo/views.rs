@@ -24,12 +24,16 @@ pub struct Views {
 }
 
 impl Views {
-    /// From JSON documents by view name; `None` if one is absent or of another shape.
-    pub fn parse(documents: &BTreeMap<String, Vec<u8>>) -> Option<Self> {
-        fn view<T: DeserializeOwned>(documents: &BTreeMap<String, Vec<u8>>, name: &str) -> Option<T> {
-            serde_json::from_slice(documents.get(name)?).ok()
+    /// From JSON documents by view name.
+    ///
+    /// # Errors
+    /// The first view that is absent or of another shape.
+    pub fn parse(documents: &BTreeMap<String, Vec<u8>>) -> Result<Self, String> {
+        fn view<T: DeserializeOwned>(documents: &BTreeMap<String, Vec<u8>>, name: &str) -> Result<T, String> {
+            let json = documents.get(name).ok_or_else(|| format!("view/{name} did not come"))?;
+            serde_json::from_slice(json).map_err(|error| format!("view/{name} is of another shape: {error}"))
         }
-        Some(Self {
+        Ok(Self {
             status: view(documents, "status")?,
             frames: view(documents, "frames")?,
             map: view(documents, "map")?,

@@ -8,11 +8,12 @@ use super::views::Views;
 use crate::config::ZenohConfig;
 use crate::keys;
 use crate::link::session::{self, Role};
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use merganser_protocol::snapshot::StatusView;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 use zenoh::Session;
 use zenoh::qos::CongestionControl;
@@ -21,6 +22,8 @@ use zenoh::qos::CongestionControl;
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// How long a robot may take to answer.
 const ANSWER_WAIT: Duration = Duration::from_secs(1);
+/// How long all views together may take.
+const VIEWS_WAIT: Duration = Duration::from_secs(5);
 /// Robots that are idle and unchanged for this long, but not merged, will not merge any more.
 const SETTLED: Duration = Duration::from_secs(5);
 /// Answers that may wait.
@@ -79,15 +82,27 @@ async fn look(session: &Session, swarm: &mut Swarm, tracks: &[Track], timeout: D
         tokio::time::sleep(LOOK_EVERY).await;
     };
     bar.finish_and_clear();
-    let documents = ask(session, swarm, "view/*").await;
-    let mut views = Vec::new();
-    for agent in &swarm.agents {
-        let own = documents.get(agent.name.as_str()).and_then(Views::parse);
-        views.push(
-            own.with_context(|| format!("{} did not show its views; its log:\n{}", agent.name, agent.log_tail()))?,
-        );
+    Ok(Seen { ending, after, views: all_views(session, swarm).await? })
+}
+
+/// All views of every robot, from one answer each. A busy robot may need to be asked again.
+async fn all_views(session: &Session, swarm: &Swarm) -> Result<Vec<Views>> {
+    let start = Instant::now();
+    loop {
+        let documents = ask(session, swarm, "view/*").await;
+        let parse = |agent: &super::swarm::Agent| {
+            let own = documents.get(agent.name.as_str()).ok_or("no view came")?;
+            Views::parse(own)
+        };
+        let views: Result<Vec<Views>> = (swarm.agents.iter())
+            .map(|agent| parse(agent).map_err(|why| anyhow!("{}: {why}; its log:\n{}", agent.name, agent.log_tail())))
+            .collect();
+        match views {
+            Err(why) if start.elapsed() < VIEWS_WAIT => tracing::debug!(%why, "asking for all views again"),
+            views => return views,
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
     }
-    Ok(Seen { ending, after, views })
 }
 
 async fn statuses(session: &Session, swarm: &Swarm) -> BTreeMap<String, StatusView> {
@@ -163,13 +178,25 @@ fn show(bar: &ProgressBar, statuses: &[Option<&StatusView>]) {
     bar.set_message(format!("{submaps} submaps, {pending} pending, {merged}/{pairs} pairs merged"));
 }
 
-/// Completes when the demonstration is told to end.
-pub(super) async fn interrupted() -> Result<Seen> {
-    use tokio::signal::unix::{SignalKind, signal};
-    let mut terminate = signal(SignalKind::terminate()).context("cannot listen for signals")?;
-    tokio::select! {
-        _ = tokio::signal::ctrl_c() => {}
-        _ = terminate.recv() => {}
+/// What tells the demonstration to end early.
+pub(super) struct Interrupts {
+    interrupt: Signal,
+    terminate: Signal,
+}
+
+impl Interrupts {
+    /// From now on, SIGINT and SIGTERM no longer end the process by themselves.
+    pub fn catch() -> Result<Self> {
+        let listen = |kind| signal(kind).context("cannot listen for signals");
+        Ok(Self { interrupt: listen(SignalKind::interrupt())?, terminate: listen(SignalKind::terminate())? })
     }
-    bail!("interrupted")
+
+    /// Fails at the first signal.
+    pub async fn wait(&mut self) -> Result<Seen> {
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+        }
+        bail!("interrupted")
+    }
 }
