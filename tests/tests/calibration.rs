@@ -1,0 +1,66 @@
+//! The uncertainty of merged frames does not lie: over 120 seeded runs of a simulated swarm the squared Mahalanobis
+//! distance of every frame's error is compared with the χ² distribution of six degrees of freedom.
+//!
+//! The band is one-sided. Errors that alignments of one submap share are charged in full (see the core's `distortion`),
+//! so estimates may be more certain than they say, never less.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
+
+use merganser_sim::report::Report;
+use merganser_tests::simulate;
+
+const SCENARIO: &str = include_str!("scenarios/calibration.toml");
+const SEEDS: u64 = 120;
+/// 95 % quantile of χ²₆.
+const CHI2_6_95: f64 = 12.591_587;
+/// MATH §6: ANEES at most 6.4, times 1.1 for what linearisation leaves out.
+const ANEES_MAX: f64 = 6.4 * 1.1;
+const COVERAGE_MIN: f64 = 0.92;
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Calibration {
+    anees: f64,
+    coverage: f64,
+}
+
+impl Calibration {
+    fn of(d2: &[f64]) -> Self {
+        let inside = d2.iter().filter(|&&d2| d2 <= CHI2_6_95).count();
+        Self { anees: d2.iter().sum::<f64>() / d2.len() as f64, coverage: inside as f64 / d2.len() as f64 }
+    }
+
+    fn is_honest(self) -> bool {
+        self.anees <= ANEES_MAX && self.coverage >= COVERAGE_MIN
+    }
+}
+
+fn run_all() -> Vec<Report> {
+    let half = |first: u64| {
+        move || (first..=SEEDS).step_by(2).map(|seed| simulate(SCENARIO, seed).unwrap()).collect::<Vec<_>>()
+    };
+    std::thread::scope(|scope| {
+        let halves = [1, 2].map(|first| scope.spawn(half(first)));
+        halves.into_iter().flat_map(|half| half.join().unwrap()).collect()
+    })
+}
+
+#[test]
+fn frames_are_never_merged_wrongly_nor_claimed_better_than_known() {
+    let reports = run_all();
+    for report in &reports {
+        assert!(report.violation.is_none(), "seed {}: {:?}", report.seed, report.violation);
+    }
+    let d2: Vec<f64> = reports.iter().flat_map(|report| &report.frame_errors).filter_map(|error| error.d2).collect();
+    let relations = 2 * reports.len();
+    let found = Calibration::of(&d2);
+    println!(
+        "{} of {relations} relations merged, ANEES {:.2} of 6, {:.1} % inside the 95 % ellipsoid",
+        d2.len(),
+        found.anees,
+        100.0 * found.coverage
+    );
+    assert!(d2.len() * 10 >= relations * 9, "only {} of {relations} relations merged", d2.len());
+    assert!(found.is_honest(), "{found:?}");
+    // The check bites: the same errors under standard deviations a third too small are not honest.
+    let claimed_better: Vec<f64> = d2.iter().map(|d2| d2 * 1.5 * 1.5).collect();
+    assert!(!Calibration::of(&claimed_better).is_honest());
+}

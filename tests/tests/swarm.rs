@@ -1,0 +1,59 @@
+//! A simulated swarm over bad radios converges, and the same seed gives the same run, in this process or another.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
+
+use merganser_sim::report::Report;
+use merganser_tests::simulate;
+use std::process::Command;
+
+const LOSSY: &str = include_str!("../../sim/scenarios/lossy.toml");
+const PARTITION: &str = include_str!("../../sim/scenarios/partition.toml");
+const CALIBRATION: &str = include_str!("scenarios/calibration.toml");
+/// Set for the child process that only prints a trace.
+const CHILD: &str = "MERGANSER_TEST_TRACE";
+
+fn converged(scenario: &str, seed: u64) -> Report {
+    let report = simulate(scenario, seed).unwrap();
+    assert!(report.violation.is_none(), "seed {seed}: {:?}", report.violation);
+    let digest = &report.robots[0].digest;
+    assert!(report.robots.iter().all(|robot| robot.digest == *digest && robot.entries > 0));
+    let robots = report.robots.len();
+    assert_eq!(report.frame_errors.len(), robots * (robots - 1), "every robot knows every other's frame");
+    report
+}
+
+#[test]
+fn a_swarm_converges_under_loss_doubling_and_reordering() {
+    let report = converged(LOSSY, 1);
+    let faults = serde_json::to_value(report.faults).unwrap();
+    let fired: u64 = faults.as_object().unwrap().values().filter_map(serde_json::Value::as_u64).sum();
+    assert!(fired > 100, "the faults must really fire: {faults}");
+}
+
+#[test]
+fn a_swarm_converges_after_partitions_heal() {
+    let report = converged(PARTITION, 1);
+    let faults = serde_json::to_value(report.faults).unwrap();
+    let fired: u64 = faults.as_object().unwrap().values().filter_map(serde_json::Value::as_u64).sum();
+    assert!(fired > 0, "the faults must really fire: {faults}");
+}
+
+#[test]
+fn the_same_seed_gives_the_same_run_and_another_seed_another() {
+    let once = simulate(CALIBRATION, 5).unwrap().trace;
+    assert_eq!(simulate(CALIBRATION, 5).unwrap().trace, once);
+    assert_ne!(simulate(CALIBRATION, 6).unwrap().trace, once);
+    let child = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "prints_a_trace_for_another_process", "--nocapture"])
+        .env(CHILD, "5")
+        .output()
+        .unwrap();
+    let said = String::from_utf8(child.stdout).unwrap();
+    assert!(said.contains(&format!("trace {once}")), "another process ran differently: {said}");
+}
+
+#[test]
+fn prints_a_trace_for_another_process() {
+    if let Ok(seed) = std::env::var(CHILD) {
+        println!("trace {}", simulate(CALIBRATION, seed.parse().unwrap()).unwrap().trace);
+    }
+}
