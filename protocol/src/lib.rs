@@ -1,5 +1,18 @@
 //! The core of Merganser: all that a robot decides, and nothing else. No clock, no socket, no thread, no async, no
 //! global randomness: same inputs, same outputs, to the bit.
+//!
+//! # The contract
+//! An [`agent::Agent`] is driven by a shell that owns the network, the disk and the clock:
+//! 1. call [`agent::Agent::handle`] once with the present time and one [`agent::io::Input`];
+//! 2. drain [`agent::Agent::poll_output`] until it is empty, and carry out each [`agent::io::Output`];
+//! 3. wait until [`agent::Agent::poll_timeout`] or the next input.
+//!
+//! Only `handle` changes anything. Heavy work is an output ([`agent::io::Output::Run`]) whose result comes back as an
+//! input; the shell runs it where it likes, or not at all for a while. Records become facts for others only after the
+//! shell says that they are durable. An error is somebody's bad input, counted and reported as an event; a panic is our
+//! bug. `tests/agent_contract.rs` holds the core to all of this.
+//!
+//! Modules point one way: `time, ids, config` ← `geometry` ← `wire` ← `submap, align, estimate, replica` ← `agent`.
 
 pub mod agent;
 pub mod align;
