@@ -1,5 +1,7 @@
 //! What the cross-crate tests share: running a scenario of the simulator with the real core.
 
+pub mod wires;
+
 use merganser_protocol::agent::Agent;
 use merganser_sim::report::Report;
 use merganser_sim::scenario::Scenario;
@@ -14,4 +16,17 @@ pub fn simulate(scenario: &str, seed: u64) -> Result<Report, String> {
     let swarm = Swarm::<Agent>::new(scenario, seed).map_err(|error| error.to_string())?;
     let outcome = swarm.run(|_| {}).map_err(|error| error.to_string())?;
     Ok(Report::of(&outcome))
+}
+
+/// The folder of real data, or `None` (saying so) where it is absent: `MERGANSER_SHARED`, or `shared` beside the
+/// workspace.
+#[allow(clippy::print_stderr, reason = "a test that was skipped must say so")]
+pub fn real_data(name: &str) -> Option<std::path::PathBuf> {
+    let beside = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared");
+    let folder = std::env::var_os("MERGANSER_SHARED").map_or(beside, Into::into).join("data").join(name);
+    if !folder.is_dir() {
+        eprintln!("skipped: no real data at {} (set MERGANSER_SHARED)", folder.display());
+        return None;
+    }
+    Some(folder)
 }

@@ -37,15 +37,19 @@ pub fn correct(track: &Track, reference: &Views, frame: &str) -> Option<Correcte
     Some(Corrected { poses: poses.collect(), anchors })
 }
 
-/// True `t_world_anchor` of a submap, `name/epoch#index`: the anchor moves with the keyframe it was cut at.
+/// True `t_world_anchor` of a submap, `name/epoch#index`: the anchor moves with the keyframe it was placed at, the one of
+/// the submap's span whose odometry is the anchor's.
 pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Se3> {
     let (frame, index) = submap.rsplit_once('#')?;
     let index: u32 = index.parse().ok()?;
     let view = views.map.submaps.iter().find(|view| view.frame == frame && view.index == index)?;
-    let begins = |stamp: &f64| (stamp - view.stamps_secs[0]).abs() <= STAMP_SLACK_SECS;
-    let first = track.stamps_secs.iter().position(begins)?;
-    let t_body_anchor = track.odometry.get(first)?.inverse() * pose(&view.t_frame_anchor)?;
-    Some(*track.truth.as_ref()?.get(first)? * t_body_anchor)
+    let t_frame_anchor = pose(&view.t_frame_anchor)?;
+    let [begin, end] = view.stamps_secs;
+    let span = (begin - STAMP_SLACK_SECS)..=(end + STAMP_SLACK_SECS);
+    let inside = (0..track.odometry.len()).filter(|&k| span.contains(&track.stamps_secs[k]));
+    let away = |k: usize| t_frame_anchor.local(&track.odometry[k]).norm();
+    let at = inside.min_by(|&a, &b| away(a).total_cmp(&away(b)))?;
+    Some(*track.truth.as_ref()?.get(at)? * track.odometry[at].inverse() * t_frame_anchor)
 }
 
 /// Root mean square errors of keyframe positions, m.

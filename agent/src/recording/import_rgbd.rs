@@ -26,8 +26,8 @@ const DEPTH_MM: std::ops::RangeInclusive<u16> = 300..=4000;
 const STRIDE: usize = 6;
 /// The camera's rate.
 const FRAME_NANOS: i64 = 1_000_000_000 / 30;
-/// A small hand-held visual odometry: 1 % of the way and a fifth of a degree per keyframe.
-const DRIFT: Drift = Drift { per_metre: 0.01, floor_m: 0.001, step_deg: 0.2 };
+/// A hand-held visual SLAM's: 1 % of the way and a tenth of a degree on each axis per keyframe (a third of a second).
+const DRIFT: Drift = Drift { per_metre: 0.01, floor_m: 0.001, step_deg: 0.1 };
 /// Largest deviation from orthonormality of a pose's rotation.
 const ROTATION_ERROR_MAX: f64 = 1e-3;
 

@@ -3,7 +3,7 @@
 
 use super::distortion;
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
-use crate::geometry::Relative;
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, SimWithCovariance};
 use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
 use crate::wire::fact::{AlignmentFact, Fact, SightingFact, SubmapFact, VerdictFact, VerdictOutcome};
 use std::collections::{BTreeMap, BTreeSet};
@@ -138,25 +138,23 @@ impl Knowledge {
         all.iter().find(|(verdict, _)| verdict.frame.robot == other).map(|(_, fact)| fact)
     }
 
-    /// The measurement that enters the estimate for an agreed alignment: the writer's mean, with the larger (by
-    /// determinant) of the two endpoints' covariances, so that no single endpoint can overstate its certainty.
+    /// The measurement that enters the estimate for an agreed alignment: midway between what the two endpoints measured,
+    /// with the larger (by determinant) of their covariances. Each looked from its own dense cloud at the other's
+    /// keypoints, so their sampling errors differ and partly cancel; what they share stays in the covariance, and no
+    /// single endpoint can overstate its certainty.
     fn measurement(&self, id: EntryId, fact: &AlignmentFact) -> Relative {
         let Some(VerdictOutcome::Measured { t_i_j, .. }) = self.verdict(id, fact).map(|v| &v.outcome) else {
             return fact.t_i_j;
         };
         match (fact.t_i_j, t_i_j) {
-            (Relative::Metric(mut mine), Relative::Metric(theirs)) => {
-                if theirs.covariance.matrix().determinant() > mine.covariance.matrix().determinant() {
-                    mine.covariance = theirs.covariance;
-                }
-                Relative::Metric(mine)
-            }
-            (Relative::Similarity(mut mine), Relative::Similarity(theirs)) => {
-                if theirs.covariance.matrix().determinant() > mine.covariance.matrix().determinant() {
-                    mine.covariance = theirs.covariance;
-                }
-                Relative::Similarity(mine)
-            }
+            (Relative::Metric(mine), Relative::Metric(theirs)) => Relative::Metric(PoseWithCovariance {
+                pose: mine.pose.interpolate(&theirs.pose, 0.5),
+                covariance: larger(mine.covariance, theirs.covariance),
+            }),
+            (Relative::Similarity(mine), Relative::Similarity(theirs)) => Relative::Similarity(SimWithCovariance {
+                sim: mine.sim.interpolate(&theirs.sim, 0.5),
+                covariance: larger(mine.covariance, theirs.covariance),
+            }),
             (mine, _) => mine,
         }
     }
@@ -181,7 +179,7 @@ impl Knowledge {
             .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
             .map(|(entry, fact)| AgreedAlignment { entry, i: fact.i, j: fact.j, t_i_j: self.measurement(entry, fact) })
             .collect();
-        distortion::charge(&mut alignments, &frames);
+        distortion::charge(&mut alignments);
         let sightings = self
             .sightings
             .iter()
@@ -195,6 +193,14 @@ impl Knowledge {
             .collect();
         MapProblem { frames, alignments, sightings }
     }
+}
+
+/// The covariance with the larger determinant.
+fn larger<const N: usize>(a: Covariance<N>, b: Covariance<N>) -> Covariance<N> {
+    let volume = |c: &Covariance<N>| -> f64 {
+        c.matrix().cholesky().map_or(f64::INFINITY, |l| l.l().diagonal().iter().map(|&x| libm::log(x)).sum())
+    };
+    if volume(&b) > volume(&a) { b } else { a }
 }
 
 /// Whether two independent measurements of one relative pose agree: d² of their difference under the sum of their

@@ -34,23 +34,32 @@ fn a_submap_ends_at_each_limit_and_not_before() {
 }
 
 #[test]
-fn anchors_chain_without_gaps_and_covariances_compound() {
+fn anchors_are_middle_keyframes_that_chain_without_gaps_and_covariances_compound() {
     let step = Se3::exp(&Vector6::new(0.5, 0.1, 0.0, 0.02, 0.0, 0.1));
     let poses: Vec<Se3> = std::iter::successors(Some(at(3.0)), |p| Some(*p * step)).take(24).collect();
     let mut builder = SubmapBuilder::new(config());
     let (_, submaps) = drive(&mut builder, &poses);
     assert!(submaps.len() >= 3);
-    assert_eq!(submaps[0].odometry.pose, poses[0]);
-    assert!((submaps[0].odometry.covariance.sigmas() - Vector6::repeat(FIRST_ANCHOR_SIGMA)).amax() < 1e-12);
     let one = PoseWithCovariance { pose: step, covariance: Covariance::from_sigmas([0.01; 6]).unwrap() };
+    let steps = |count: usize| (1..count).fold(one, |sum, _| sum.compose(&one));
+    let count = submaps[0].keyframes.len();
+    let middle = (count - 1) / 2;
+    assert!(count > 2 && middle > 0);
+    assert_eq!(submaps[0].keyframes[middle], Se3::identity());
+    assert!(submaps[0].odometry.pose.local(&poses[middle]).amax() < 1e-12);
+    // From the frame's origin: the first body pose is certain, and the cloud is nearer to it than its anchor.
+    let sure = isotropic(FIRST_ANCHOR_SIGMA, FIRST_ANCHOR_SIGMA, &one.covariance);
+    let walk = PoseWithCovariance { covariance: steps(middle).covariance.scaled(FIRST_CLOUD_SHARE), ..steps(middle) };
+    let expected = PoseWithCovariance { pose: poses[0], covariance: sure }.compose(&walk);
+    let difference = submaps[0].odometry.covariance.matrix() - expected.covariance.matrix();
+    assert!(difference.amax() < 1e-12, "{difference}");
     for (k, pair) in submaps.windows(2).enumerate() {
         assert_eq!(pair[1].index as usize, k + 1);
         let chained = pair[0].t_frame_anchor * pair[1].odometry.pose;
         assert!(chained.local(&pair[1].t_frame_anchor).amax() < 1e-12);
-        // As many motions as keyframes in the first submap lie between the two anchors.
-        let expected = (1..pair[0].keyframes.len()).fold(one, |sum, _| sum.compose(&one));
-        let difference = pair[1].odometry.covariance.matrix() - expected.covariance.matrix();
-        assert!(difference.amax() < 1e-12, "{difference}");
+        let between = pair[0].keyframes.len() - (pair[0].keyframes.len() - 1) / 2 + (pair[1].keyframes.len() - 1) / 2;
+        let difference = pair[1].odometry.covariance.matrix() - steps(between).covariance.matrix();
+        assert!(difference.amax() < 1e-9, "{difference}");
     }
     let (index, t_anchor_body, stamp) = builder.body_since_anchor().unwrap();
     let last = submaps.last().unwrap();
@@ -115,6 +124,19 @@ fn bad_keyframes_are_refused_by_name_and_change_nothing() {
     builder.push(keyframe(6, at(0.2), &crowd[1..])).unwrap();
     let submap = builder.flush().unwrap();
     assert_eq!((submap.stamps, submap.cloud.len()), ([Stamp(5), Stamp(6)], 1));
+}
+
+#[test]
+fn stamps_may_be_as_large_as_the_wire_can_carry() {
+    for stamp in [i64::MIN, -STAMP_MAX - 1, STAMP_MAX + 1, i64::MAX] {
+        let refused = SubmapBuilder::new(config()).push(keyframe(stamp, at(0.0), &[]));
+        assert_eq!(refused, Err(KeyframeError::StampOutOfRange { stamp }));
+    }
+    let mut builder = SubmapBuilder::new(config());
+    builder.push(keyframe(-STAMP_MAX, at(0.0), &[])).unwrap();
+    builder.push(keyframe(STAMP_MAX, at(0.1), &[])).unwrap();
+    let [first, last] = builder.flush().unwrap().stamps;
+    assert!(last.0.checked_sub(first.0).is_some());
 }
 
 #[test]

@@ -137,6 +137,10 @@ pub fn refine(
             let pose = PoseWithCovariance { pose, covariance };
             return Ok(Refined { pose, rms: system.sigma, pairs: pairs.len() });
         }
+        if iteration + 1 == config.iterations_max {
+            // Along a free direction a pose may slide for ever: then that is the reason.
+            system.covariance(their_surfels.len(), scene.voxel, config)?;
+        }
         pose = pose.retract(&(system.to_anchor() * system.step));
     }
     Err(RefineError::NotConverged)

@@ -40,8 +40,14 @@ pub fn config(voxel_m: f64, keyframes_max: u32) -> SubmapConfig {
     SubmapConfig { voxel_m, keyframes_max, distance_m: 1e3, rotation_deg: 1e6, keypoints: 512, ..Default::default() }
 }
 
+/// A submap of keyframes at poses that are true.
 pub fn place(config: &SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>) -> Place {
-    let t_world_anchor = keyframes[0].0;
+    let truth: Vec<Se3> = keyframes.iter().map(|(pose, _)| *pose).collect();
+    place_drifted(config, keyframes, &truth)
+}
+
+/// A submap of keyframes at believed poses; the anchor is truly where the keyframe is that it was placed at.
+pub fn place_drifted(config: &SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>, truth: &[Se3]) -> Place {
     let mut builder = SubmapBuilder::new(SubmapConfig { keyframes_max: 10_000, ..config.clone() });
     for (k, (pose, points)) in keyframes.into_iter().enumerate() {
         let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
@@ -50,6 +56,7 @@ pub fn place(config: &SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>) -> Pla
         builder.push(Keyframe { stamp, pose, covariance_of: CovarianceOf::Motion, points }).unwrap();
     }
     let submap = builder.flush().unwrap();
+    let t_world_anchor = truth[submap.keyframes.iter().position(|t| t.log().amax() < 1e-9).unwrap()];
     let start = thread_cpu_ms();
     let described = describe(&submap, config);
     let describe_ms = start.and_then(|start| Some(thread_cpu_ms()? - start));

@@ -88,7 +88,7 @@ fn a_corridor_is_refused_however_it_is_shifted_along() {
     let set = World::corridor().set("corridor", 6, [1.0, 0.5], 0.002, 3);
     for (theirs, mine, truth) in pairs(&set) {
         for shift in [0.0, 0.3] {
-            let along = set.places[0].t_world_anchor.rotation.inverse() * nalgebra::Vector3::x();
+            let along = theirs.t_world_anchor.rotation.inverse() * nalgebra::Vector3::x();
             let rough =
                 truth * Se3::exp(&Vector6::new(along.x * shift, along.y * shift, along.z * shift, 0.0, 0.0, 0.0));
             let (keypoints, features) = (&theirs.described.keypoints, &mine.described.features);

@@ -1,7 +1,7 @@
 //! A ray-cast world: boxes seen from inside and outside, pillars, and a spinning range sensor with noise and odometry
 //! that drifts inside each submap.
 
-use crate::data::{Place, Set, config, place};
+use crate::data::{Place, Set, config, place_drifted};
 use merganser_protocol::geometry::{Se3, So3};
 use nalgebra::{Vector3, Vector6};
 use rand::{RngExt, SeedableRng};
@@ -104,15 +104,16 @@ impl World {
             }
         };
         let mut believed = t_world_body;
-        let mut keyframes = Vec::new();
+        let (mut keyframes, mut truth) = (Vec::new(), Vec::new());
         for _ in 0..5 {
+            truth.push(t_world_body);
             keyframes.push((believed, self.scan(&t_world_body, noise, rng)));
             let step = Vector6::new(0.4, 0.0, 0.0, 0.0, 0.0, heading);
             let error = Vector6::from_fn(|k, _| gaussian(rng) * drift * if k < 3 { 1.0 } else { 0.3 });
             t_world_body = t_world_body.retract(&step);
             believed = believed.retract(&(step + error));
         }
-        place(&config(voxel, 5), keyframes)
+        place_drifted(&config(voxel, 5), keyframes, &truth)
     }
 
     /// Several submaps of this world.

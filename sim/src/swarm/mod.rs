@@ -21,7 +21,6 @@ use crate::network::{Network, millis};
 use crate::queue::Queue;
 use crate::scenario::Scenario;
 use crate::stage::{Stage, StageError};
-use crate::truth::rigid;
 use merganser_protocol::agent::io::{Channel, Command, Event as Told, Input, JobId, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
 use merganser_protocol::agent::{Restored, StartError};
@@ -441,17 +440,17 @@ impl<C: Core> Swarm<C> {
         self.robots.iter().filter_map(&mut sample).collect()
     }
 
-    /// A frame truly lies where its first submap's anchor does: every estimate starts there. Until a robot has one, its
-    /// first keyframe stands in; they differ if a crash swallowed what came between.
+    /// A frame truly lies where the first keyframe of its first submap does: every estimate starts there. Until a robot
+    /// has one, its first keyframe stands in; they differ if a crash swallowed what came between.
     fn pin_frames(&mut self, samples: &[RobotSample]) {
         for snapshot in samples.iter().filter_map(|sample| sample.snapshot.as_ref()) {
             let first = |s: &&SubmapView| s.index == 0 && s.robot == snapshot.status.robot;
             for submap in snapshot.map.submaps.iter().filter(first) {
                 let Some(robot) = self.find(&submap.robot) else { continue };
-                let nanos = self.robots[robot].slam.drive_nanos(submap.stamps_secs[0]);
-                let step = self.stage.steps(robot).iter().min_by_key(|step| step.nanos.abs_diff(nanos));
-                if let (Some(step), Some(t_frame_anchor)) = (step, rigid(&submap.t_frame_anchor)) {
-                    self.truth.insert(submap.frame.clone(), step.t_world_body * t_frame_anchor.inverse());
+                let slam = &self.robots[robot].slam;
+                let nanos = slam.drive_nanos(submap.stamps_secs[0]);
+                if let Some(step) = self.stage.steps(robot).iter().min_by_key(|step| step.nanos.abs_diff(nanos)) {
+                    self.truth.insert(submap.frame.clone(), step.t_world_body * slam.t_frame_body(step).inverse());
                 }
             }
         }

@@ -147,8 +147,8 @@ impl<C> Robot<C> {
 /// a new local frame.
 pub(super) struct Slam {
     stamp_offset: i64,
-    /// Of the present SLAM frame in the drive's.
-    t_drive_frame: Se3,
+    /// When each frame that a restart began, began, ns, and where in the drive.
+    frames: Vec<(u64, Se3)>,
     restart: bool,
     /// Motion since the last keyframe that the agent took.
     motion: Option<PoseWithCovariance>,
@@ -157,7 +157,7 @@ pub(super) struct Slam {
 impl Slam {
     pub fn new(offset_secs: f64) -> Self {
         let stamp_offset = FIRST_STAMP_NS + (offset_secs * 1e9) as i64;
-        Self { stamp_offset, t_drive_frame: Se3::identity(), restart: false, motion: None }
+        Self { stamp_offset, frames: Vec::new(), restart: false, motion: None }
     }
 
     /// Time since the drive began of a stamp in seconds, ns: good to a microsecond.
@@ -170,6 +170,12 @@ impl Slam {
         self.restart = true;
     }
 
+    /// Odometry of the body at `step`, in the frame of that time.
+    pub fn t_frame_body(&self, step: &Step) -> Se3 {
+        let begun = self.frames.iter().rev().find(|(nanos, _)| *nanos <= step.nanos);
+        begun.map_or(step.t_frame_body, |(_, t_drive_frame)| t_drive_frame.inverse() * step.t_frame_body)
+    }
+
     /// The agent will not see this keyframe: its motion belongs to the next one.
     pub fn skip(&mut self, step: &Step) {
         self.motion = Some(self.motion_with(step));
@@ -180,10 +186,10 @@ impl Slam {
         let mut motion = self.motion_with(step);
         self.motion = None;
         if core::mem::take(&mut self.restart) {
-            self.t_drive_frame = step.t_frame_body;
+            self.frames.push((step.nanos, step.t_frame_body));
             motion.covariance = Covariance::from_sigmas([FIRST_SIGMA; 6])?;
         }
-        let pose = self.t_drive_frame.inverse() * step.t_frame_body;
+        let pose = self.t_frame_body(step);
         Ok(Keyframe {
             stamp: Stamp(self.stamp_offset.saturating_add_unsigned(step.nanos)),
             pose: PoseWithCovariance { pose, covariance: motion.covariance },

@@ -1,0 +1,174 @@
+//! A shell with perfect wires for real cores and recordings: everything arrives at once, every record is durable at
+//! once, jobs run where they are asked for. What a robot sees is then a function of the recordings alone.
+
+use merganser::recording::Recording;
+use merganser::trust::SecretKey;
+use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Output};
+use merganser_protocol::agent::{Agent, Identity, Restored};
+use merganser_protocol::ids::{Name, RobotId};
+use merganser_protocol::time::Instant;
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+/// Virtual time after the last keyframe.
+const SETTLE: Duration = Duration::from_secs(30);
+
+/// A member of every roster here that runs no core: its key is the test's to lie with.
+pub const LIAR: &str = "mallory";
+/// Its secret key.
+pub const LIAR_SECRET: [u8; 32] = [99; 32];
+
+/// Cores on perfect wires.
+pub struct Wires {
+    /// The cores.
+    pub agents: Vec<Agent>,
+    /// Virtual time.
+    pub now: Instant,
+    /// Everything published, with its sender's index.
+    pub published: Vec<(usize, Channel, Vec<u8>)>,
+    /// Every event, with the index of the core that told it.
+    pub events: Vec<(usize, Event)>,
+    inbox: VecDeque<(usize, Input)>,
+}
+
+/// Plays recordings into a core each, in the order of their stamps, until `SETTLE` after the last.
+///
+/// # Errors
+/// Text: a recording that cannot be read, or a configuration that a core refuses.
+pub fn play(recordings: &[Recording], seed: u64) -> Result<Wires, String> {
+    play_with(recordings, seed, |_, _| {})
+}
+
+/// As [`play`], and calls `meddle` with the number of keyframes handed out before each of them.
+///
+/// # Errors
+/// As [`play`].
+pub fn play_with(
+    recordings: &[Recording],
+    seed: u64,
+    mut meddle: impl FnMut(&mut Wires, usize),
+) -> Result<Wires, String> {
+    let mut wires = Wires::new(recordings, seed)?;
+    let mut order: Vec<(i64, usize, usize)> = Vec::new();
+    for (robot, recording) in recordings.iter().enumerate() {
+        let first = recording.keyframes().first().map_or(0, |line| line.stamp.0);
+        order
+            .extend(recording.keyframes().iter().enumerate().map(|(index, line)| (line.stamp.0 - first, robot, index)));
+    }
+    order.sort_unstable();
+    for (count, (nanos, robot, index)) in order.into_iter().enumerate() {
+        meddle(&mut wires, count);
+        wires.run_to(Instant::ZERO.after(Duration::from_nanos(nanos.unsigned_abs())));
+        let keyframe = recordings[robot].keyframe(index).map_err(|error| error.to_string())?;
+        wires.input(robot, Input::Keyframe(keyframe));
+    }
+    for robot in 0..recordings.len() {
+        wires.input(robot, Input::Command(Command::Flush));
+    }
+    let end = wires.now.after(SETTLE);
+    wires.run_to(end);
+    Ok(wires)
+}
+
+impl Wires {
+    fn new(recordings: &[Recording], seed: u64) -> Result<Self, String> {
+        let secret = |k: usize| [k as u8 + 1; 32];
+        let public = |k: usize| SecretKey::from_bytes(secret(k)).public();
+        let mut roster: BTreeMap<Name, [u8; 32]> =
+            recordings.iter().enumerate().map(|(k, r)| (r.manifest().robot.clone(), public(k).to_bytes())).collect();
+        let liar = Name::new(LIAR).map_err(|error| error.to_string())?;
+        roster.insert(liar, SecretKey::from_bytes(LIAR_SECRET).public().to_bytes());
+        let swarm = Name::new("wires").map_err(|error| error.to_string())?;
+        let mut agents = Vec::new();
+        for (k, recording) in recordings.iter().enumerate() {
+            let manifest = recording.manifest();
+            let (name, secret_key) = (manifest.robot.clone(), secret(k));
+            let identity = Identity { swarm: swarm.clone(), name, secret_key, roster: roster.clone() };
+            let seed = seed.wrapping_add(k as u64);
+            let agent = Agent::new(manifest.config.clone(), identity, seed, Restored::default(), Instant::ZERO);
+            agents.push(agent.map_err(|error| error.to_string())?);
+        }
+        let mut wires =
+            Self { agents, now: Instant::ZERO, published: Vec::new(), events: Vec::new(), inbox: VecDeque::new() };
+        for a in 0..wires.agents.len() {
+            for b in (0..wires.agents.len()).filter(|b| *b != a) {
+                let robot = wires.agents[b].robot();
+                wires.inbox.push_back((a, Input::Neighbour { robot, up: true }));
+            }
+        }
+        wires.settle();
+        Ok(wires)
+    }
+
+    /// Publishes bytes to every core in the name of `from`, which runs none.
+    pub fn publish_as(&mut self, from: RobotId, channel: Channel, bytes: &[u8]) {
+        for robot in 0..self.agents.len() {
+            self.input(robot, Input::Received { from, channel, bytes: bytes.to_vec() });
+        }
+    }
+
+    /// Gives one core an input and carries all that follows.
+    pub fn input(&mut self, robot: usize, input: Input) {
+        self.inbox.push_back((robot, input));
+        self.settle();
+    }
+
+    /// Lets virtual time pass, in steps to every wake-up that a core asked for.
+    pub fn run_to(&mut self, end: Instant) {
+        loop {
+            let next = self.agents.iter().filter_map(Agent::poll_timeout).min().unwrap_or(end).max(self.now);
+            if next > end {
+                break;
+            }
+            self.now = next.after(Duration::from_millis(1));
+            for robot in 0..self.agents.len() {
+                self.inbox.push_back((robot, Input::Timeout));
+            }
+            self.settle();
+        }
+        self.now = self.now.max(end);
+    }
+
+    fn settle(&mut self) {
+        while let Some((robot, input)) = self.inbox.pop_front() {
+            self.agents[robot].handle(self.now, input);
+            while let Some(output) = self.agents[robot].poll_output() {
+                self.carry(robot, output);
+            }
+        }
+    }
+
+    fn carry(&mut self, robot: usize, output: Output) {
+        match output {
+            Output::Persist { batch, .. } => self.inbox.push_back((robot, Input::Persisted { up_to: batch })),
+            Output::Publish { channel, bytes } => {
+                let from = self.agents[robot].robot();
+                for other in (0..self.agents.len()).filter(|other| *other != robot) {
+                    self.inbox.push_back((other, Input::Received { from, channel, bytes: bytes.clone() }));
+                }
+                self.published.push((robot, channel, bytes));
+            }
+            Output::Ask { query, peer, kind, bytes } => {
+                let token = AskToken(query.0);
+                let other = self.agents.iter().position(|agent| agent.robot() == peer);
+                let bytes = other.and_then(|other| self.ask(other, Input::Asked { token, kind, bytes }, token));
+                self.inbox.push_back((robot, Input::Answered { query, bytes }));
+            }
+            Output::Answer { .. } => {}
+            Output::Event(event) => self.events.push((robot, event)),
+            Output::Run { id, job } => self.inbox.push_back((robot, Input::JobDone { job: id, result: job.run() })),
+        }
+    }
+
+    fn ask(&mut self, robot: usize, question: Input, token: AskToken) -> Option<Vec<u8>> {
+        self.agents[robot].handle(self.now, question);
+        let mut answer = None;
+        while let Some(output) = self.agents[robot].poll_output() {
+            match output {
+                Output::Answer { token: of, bytes } if of == token => answer = Some(bytes),
+                output => self.carry(robot, output),
+            }
+        }
+        answer
+    }
+}

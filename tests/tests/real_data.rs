@@ -1,0 +1,62 @@
+//! Real depth images through the importer and the cores, on perfect wires: what the estimate is worth when no message is
+//! lost, and a function of the data and the seed of the drift alone.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
+
+use merganser::demo::evaluate::{Bounds, CHI2_6_95, Evaluation, evaluate};
+use merganser::demo::track::Track;
+use merganser::demo::views::Views;
+use merganser::recording::import::prepare;
+use merganser_protocol::agent::Agent;
+use merganser_protocol::snapshot::Snapshot;
+use merganser_tests::real_data;
+use merganser_tests::wires::play;
+use std::ops::Range;
+use std::path::Path;
+
+const BOUNDS: Bounds = Bounds { translation_m: 0.05, rotation_deg: 2.0 };
+
+fn merge(data: &Path, seed: u64) -> Evaluation {
+    let out = tempfile::tempdir().unwrap();
+    let recordings = prepare(data, out.path(), seed).unwrap();
+    let wires = play(&recordings, seed).unwrap();
+    let tracks: Vec<Track> = recordings.iter().map(Track::of).collect();
+    let views = |agent: &Agent| {
+        let Snapshot { status, frames, map, graph, stats, .. } = agent.snapshot(wires.now);
+        Views { status, frames, map, graph, stats }
+    };
+    let views: Vec<Views> = wires.agents.iter().map(views).collect();
+    evaluate(&tracks, &views, &BOUNDS)
+}
+
+#[test]
+fn three_robots_merge_on_real_depth_images() {
+    let Some(data) = real_data("rgbd_7scenes") else { return };
+    let mut nees = Vec::new();
+    for seed in seeds() {
+        let found = merge(&data, seed);
+        for pair in &found.pairs {
+            let error = pair.error.unwrap_or_else(|| panic!("seed {seed}: {:?} {:?}", pair.robots, pair.status));
+            println!(
+                "seed {seed} {:?}: {:.3} m, {:.2} deg, NEES {:.1}",
+                pair.robots, error.translation_m, error.rotation_deg, error.nees
+            );
+            nees.push(error.nees);
+        }
+        for check in &found.checks {
+            assert!(check.held, "seed {seed}: {}: {}", check.what, check.found);
+        }
+    }
+    let inside = nees.iter().filter(|&&nees| nees <= CHI2_6_95).count();
+    println!(
+        "{} pairs, mean NEES {:.2}, {inside} inside 95 %",
+        nees.len(),
+        nees.iter().sum::<f64>() / nees.len() as f64
+    );
+}
+
+/// The seeds of the drift: 1 to 3, or as `SEEDS=21..33` says.
+fn seeds() -> Range<u64> {
+    let text = std::env::var("SEEDS").unwrap_or_else(|_| "1..4".into());
+    let (first, end) = text.split_once("..").unwrap();
+    first.parse().unwrap()..end.parse().unwrap()
+}
