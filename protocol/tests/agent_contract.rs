@@ -174,6 +174,7 @@ fn a_restart_resumes_the_log_where_it_was_durable() {
     for keyframe in &keyframes[..12] {
         wires.input(0, Input::Keyframe(keyframe.clone()));
     }
+    wires.run(Duration::from_secs(20)); // many more live poses than the second life will send
     let before = wires.agents[0].status();
     assert!(before.submaps >= 2);
     let records: Vec<Record> = wires.disks[0].clone();
@@ -189,6 +190,9 @@ fn a_restart_resumes_the_log_where_it_was_durable() {
     wires.input(0, Input::Command(Command::Flush));
     wires.run(Duration::from_secs(5));
     assert!(wires.agents[0].status().submaps > before.submaps);
+    let seen = wires.agents[1].snapshot(wires.now).poses.robots;
+    let alpha = seen.iter().find(|robot| robot.robot == "alpha").unwrap();
+    assert_eq!(alpha.stamp_secs, keyframes[18].stamp.as_secs_f64(), "the peer follows its live pose as well");
     assert_eq!(wires.agents[1].digest(), wires.agents[0].digest(), "the peer accepts what the second life wrote");
 }
 

@@ -87,6 +87,20 @@ pub enum Fault {
 }
 
 impl Fault {
+    /// Whether it keeps messages of the robot `from` from the robot `to`.
+    pub fn severs(&self, from: &str, to: &str) -> bool {
+        match self {
+            Self::Partition { groups, .. } => {
+                let group = |name: &str| groups.iter().position(|group| group.iter().any(|member| member == name));
+                // Those in no group are cut off from one another as well.
+                group(from).is_none() || group(from) != group(to)
+            }
+            Self::Isolate { robot, .. } => robot == from || robot == to,
+            Self::OneWay { from: one, to: other, .. } => one == from && other == to,
+            _ => false,
+        }
+    }
+
     /// When it begins, s.
     pub fn begins(&self) -> f64 {
         match *self {

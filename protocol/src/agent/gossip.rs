@@ -200,7 +200,8 @@ impl Agent {
         }
         let robot = beacon.robot();
         let newer = self.gossip.beacons.get(&robot).is_none_or(|seen| {
-            let age = |content: &BeaconContent| (content.anchor.frame.epoch, content.counter);
+            // The counter begins anew with the process, the stamps of one epoch do not.
+            let age = |content: &BeaconContent| (content.anchor.frame.epoch, content.stamp, content.counter);
             age(beacon) > age(&seen.content)
         });
         if newer && robot != self.me.robot {

@@ -382,7 +382,7 @@ impl<C: Core> Swarm<C> {
         let n = self.robots.len();
         for from in 0..n {
             for to in 0..n {
-                if from != to && severs(fault, self.robots[from].name.as_str(), self.robots[to].name.as_str()) {
+                if from != to && fault.severs(self.robots[from].name.as_str(), self.robots[to].name.as_str()) {
                     self.network.block(from, to, blocked);
                 }
             }
@@ -488,19 +488,6 @@ impl Event {
             Self::Hear { observer, .. } => Some(observer),
             Self::Boot { .. } | Self::FaultBegins(_) | Self::FaultEnds(_) | Self::Heal | Self::Sample => None,
         }
-    }
-}
-
-fn severs(fault: &Fault, from: &str, to: &str) -> bool {
-    match fault {
-        Fault::Partition { groups, .. } => {
-            let group = |name: &str| groups.iter().position(|group| group.iter().any(|member| member == name));
-            // Those in no group are cut off from one another as well.
-            group(from).is_none() || group(from) != group(to)
-        }
-        Fault::Isolate { robot, .. } => robot == from || robot == to,
-        Fault::OneWay { from: one, to: other, .. } => one == from && other == to,
-        _ => false,
     }
 }
 
