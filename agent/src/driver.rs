@@ -6,10 +6,10 @@ use crate::journal::{self, Frame, StoredInput};
 use crate::queue::{Inbox, Outbox};
 use crate::store;
 use merganser_protocol::agent::Agent;
-use merganser_protocol::agent::io::{AskToken, Channel, Event, Input, JobId, Output, QueryId, QueryKind};
+use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, JobId, Output, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
 use merganser_protocol::ids::{Hash, RobotId};
-use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::snapshot::{Snapshot, StatusView};
 use merganser_protocol::submap::Keyframe;
 use merganser_protocol::time::Instant;
 use std::sync::Arc;
@@ -21,6 +21,8 @@ use tracing::{debug, error, info, warn};
 const TIMEOUT_STEP: Duration = Duration::from_millis(1);
 /// Longest time that journal frames stay in memory.
 const JOURNAL_FLUSH: Duration = Duration::from_millis(500);
+/// Longest that an orderly end waits for the last submap to be described and stored.
+const PARKING: Duration = Duration::from_secs(5);
 /// Requests for snapshots that may wait.
 const VIEWS_WAITING: usize = 16;
 
@@ -34,6 +36,8 @@ pub trait Core: Send + 'static {
     fn poll_timeout(&self) -> Option<Instant>;
     /// See [`Agent::digest`].
     fn digest(&self) -> Hash;
+    /// See [`Agent::status`].
+    fn status(&self) -> StatusView;
     /// What the core believes now.
     fn snapshot(&self, now: Instant) -> Snapshot;
 }
@@ -50,6 +54,9 @@ impl Core for Agent {
     }
     fn digest(&self) -> Hash {
         Self::digest(self)
+    }
+    fn status(&self) -> StatusView {
+        Self::status(self)
     }
     fn snapshot(&self, now: Instant) -> Snapshot {
         Self::snapshot(self, now)
@@ -157,7 +164,7 @@ impl<C: Core, N: Network> Driver<C, N> {
         (Self { parts, workers, views, journal_flushed: Instant::ZERO, inputs: 0 }, Snapshots(sender))
     }
 
-    /// Runs until `stop` comes. All batches handed to the store are on disk when it returns.
+    /// Runs until `stop` comes, then closes the open submap. All batches handed to the store are on disk when it returns.
     pub async fn run(mut self, stop: impl Future<Output = ()>) -> Finished {
         let mut stop = std::pin::pin!(stop);
         let mut after_timeout = false;
@@ -180,7 +187,33 @@ impl<C: Core, N: Network> Driver<C, N> {
                 self.handle(input);
             }
         }
+        self.park().await;
         self.finish()
+    }
+
+    /// Closes the open submap and goes on until it is stated and durable, for [`PARKING`] at most.
+    async fn park(&mut self) {
+        let clock = self.parts.clock;
+        let deadline = clock.now().after(PARKING);
+        self.handle(Input::Command(Command::Flush));
+        while self.unsaved() {
+            let input = tokio::select! {
+                biased;
+                () = clock.reach(deadline) => {
+                    warn!(?PARKING, "the last submap could not be saved in time");
+                    return;
+                }
+                input = self.parts.outbox.next() => input,
+            };
+            if let Some(input) = input {
+                self.handle(input);
+            }
+        }
+    }
+
+    fn unsaved(&self) -> bool {
+        let status = self.parts.core.status();
+        status.unsaved > 0 && !status.receive_only
     }
 
     /// When to send [`Input::Timeout`]. Right after one, not at once: inputs must have their turn.

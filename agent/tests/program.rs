@@ -5,6 +5,8 @@ mod common;
 
 use common::{PATIENCE, swarm};
 use merganser::config::FileConfig;
+use merganser::store::Store;
+use merganser_protocol::agent::io::Record;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::Instant;
@@ -111,6 +113,32 @@ fn run_is_fed_watched_ended_and_replayed() {
     assert_eq!(replayed.status.code(), Some(0), "{}", text(&replayed.stderr));
     let said = text(&replayed.stdout);
     assert!(said.starts_with(&digest) && said.contains("the same digest"), "{said}");
+}
+
+#[test]
+fn an_agent_that_is_ended_in_mid_drive_keeps_the_submap_it_was_in() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path();
+    recording(&folder.join("walk"));
+    let endpoints = write_configs(folder, &["alpha"]);
+    // The second keyframe would come in eight minutes.
+    let agent = spawn(&["run", "-c", "alpha.toml", "--recording", "walk", "--speed", "0.001"], folder);
+    let watch = ["watch", "--swarm", "test", "--no-multicast", "--connect", &endpoints[0], "--for", "1", "--json"];
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let seen = text(&spawn(&watch, folder).wait_with_output().unwrap().stdout);
+        let lines = seen.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+        if lines.filter(|line| line["channel"] == "view/status").any(|line| line["message"]["keyframes"] == 1) {
+            break;
+        }
+        assert!(Instant::now() < deadline, "{seen}");
+    }
+    let ended = terminate(agent);
+    assert_eq!(ended.status.code(), Some(0), "{}", text(&ended.stderr));
+    let config = FileConfig::load(&folder.join("alpha.toml")).unwrap();
+    let store = Store::open(&config.store.path, &config.swarm, &config.robot).unwrap();
+    let records = store.load().unwrap().records;
+    assert!(records.iter().any(|record| matches!(record, Record::Entry { .. })), "{records:?}");
 }
 
 #[test]

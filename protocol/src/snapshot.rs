@@ -70,6 +70,8 @@ pub struct StatusView {
     pub keyframes: u64,
     /// Pairs of submaps still to be tried by this robot, jobs running, records not yet durable.
     pub pending: u64,
+    /// Of these, what a restart would lose: submaps not yet stated, records not yet durable.
+    pub unsaved: u64,
     /// Nothing is pending and the joint estimate is of the present set.
     pub idle: bool,
     /// Names of robots of which at least one frame is merged with this robot's present frame.

@@ -103,6 +103,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
             pending: 0,
             idle: true,
             merged_with: others(own),
+            unsaved: 0,
             receive_only: false,
         },
         frames: FramesView {

@@ -10,7 +10,7 @@ use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::{Input, Output};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::{Hash, Name};
-use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::snapshot::{Snapshot, StatusView};
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::{Instant, Stamp};
 use nalgebra::Vector3;
@@ -113,6 +113,9 @@ impl Core for Puppet {
     }
     fn digest(&self) -> Hash {
         Hash::of(b"puppet")
+    }
+    fn status(&self) -> StatusView {
+        real_core_of_nobody().status()
     }
     fn snapshot(&self, now: Instant) -> Snapshot {
         real_core_of_nobody().snapshot(now)

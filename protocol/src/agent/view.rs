@@ -41,6 +41,7 @@ impl Agent {
             submaps: self.negotiation.own().count() as u64,
             keyframes: self.mapper.keyframes,
             pending,
+            unsaved: self.unsaved(),
             idle: pending == 0 && settled,
             merged_with: self.merged_with(),
             receive_only: self.receive_only,
@@ -49,9 +50,13 @@ impl Agent {
 
     /// Work that this robot still has to do with the facts it holds.
     fn pending(&self) -> u64 {
-        let writing = self.ledger.waiting.len() + self.ledger.open.len();
         let aligning = self.negotiation.running.len() + self.answers_owed().len() + self.active_candidates().len();
-        (writing + aligning + self.mapper.pending()) as u64
+        self.unsaved() + aligning as u64
+    }
+
+    /// What a restart now would lose.
+    fn unsaved(&self) -> u64 {
+        (self.ledger.waiting.len() + self.ledger.open.len() + self.mapper.pending()) as u64
     }
 
     fn merged_with(&self) -> Vec<String> {

@@ -173,6 +173,7 @@ pub(crate) mod tests {
             pending: 0,
             idle: true,
             merged_with: frames.iter().filter_map(|(f, _)| f.split('/').next().map(str::to_owned)).collect(),
+            unsaved: 0,
             receive_only: false,
         };
         let frame = |(frame, t): &(&str, RelationView)| FrameView {
