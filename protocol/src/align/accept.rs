@@ -13,7 +13,7 @@ use libm::{log, log10};
 /// Fewest matches that can be significant.
 pub(super) const COUNT_MIN: usize = 5;
 /// Residuals beyond this many σ_max cannot be inliers: the 99 % quantile of χ₃.
-const REACH: f64 = 3.368_2;
+pub(super) const REACH: f64 = 3.368_2;
 
 /// Points closer than so many σ̂ are one piece of evidence.
 const SEPARATION: f64 = 2.0;

@@ -17,6 +17,10 @@ const LEVELS: u32 = 5;
 const LEVEL_COSTS: [usize; LEVELS as usize] = [20, 10, 4, 4, 8];
 /// Candidates evaluated on all matches, per step.
 const EVALUATED: usize = 3;
+/// A candidate whose log₁₀ NFA in a prefix is beyond this is not evaluated,
+const PREFIX_MAX: f64 = 2.5;
+/// nor one that is so far from the bar on all matches.
+const WHOLE_MARGIN: f64 = 3.0;
 /// Matches of a rival expected in the prefix in which it is sought.
 const RIVAL_EXPECTED: f64 = 20.0;
 /// An inlier lies within so many σ̂: the 99 % quantile of χ₃, and a margin.
@@ -130,7 +134,12 @@ impl<'a> Search<'a> {
         let mut candidates = core::mem::take(&mut self.candidates);
         self.sampler.propose(&self.context, prefix, &step, &mut candidates);
         let mut best: Option<Evaluated> = None;
+        let whole = prefix.len() == self.context.matches.len();
+        let hopeless = if whole { bar + WHOLE_MARGIN } else { PREFIX_MAX };
         for candidate in candidates.iter().take(EVALUATED) {
+            if -candidate.worth.score * core::f64::consts::LOG10_E > hopeless {
+                break;
+            }
             let Some(found) = self.evaluate(candidate, bar, taken) else { continue };
             if best.as_ref().is_none_or(|b| found.significance.log10_nfa < b.significance.log10_nfa) {
                 best = Some(found);

@@ -18,11 +18,14 @@ mod chance;
 mod consensus;
 mod covariance;
 mod evidence;
+mod graph;
 mod prepare;
 mod refine;
 mod sample;
+mod scales;
 pub mod sigma;
 mod solve;
+mod tally;
 #[cfg(test)]
 mod tests;
 
