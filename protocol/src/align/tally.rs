@@ -28,7 +28,7 @@ pub(super) struct Worth {
 /// Tables for one problem and one pool of matches.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
-    /// ln C(n, k) + ln (n − 3).
+    /// ln C(n, k) + ln ((k − 3)(k − 2)).
     log_tests: Vec<f64>,
     /// Per bin: upper radius in target units, −ln α, ln π₃.
     bins: Vec<[f64; 3]>,
@@ -53,13 +53,13 @@ impl Tally {
         }
         if self.log_tests.len() != count + 1 {
             let n = count as f64;
-            let mut total = log((n - 3.0).max(1.0));
+            let mut choose = 0.0;
             self.log_tests.clear();
-            self.log_tests.push(total);
+            self.log_tests.push(0.0);
             for k in 1..=count {
                 let k = k as f64;
-                total += log((n - k + 1.0) / k);
-                self.log_tests.push(total);
+                choose += log((n - k + 1.0) / k);
+                self.log_tests.push(choose + log(((k - 3.0) * (k - 2.0)).max(1.0)));
             }
         }
     }
