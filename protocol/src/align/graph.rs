@@ -226,17 +226,19 @@ pub(super) fn pack(flags: &[u8; 64]) -> u64 {
 /// Room that [`positions`] needs beyond the number of bits.
 const POSITIONS_ROOM: usize = 72;
 
-/// Writes the positions of the bits set after `after` to the beginning of `out`, which has room for all bits and
+/// Writes the positions of the bits set (after `after`) to the beginning of `out`, which has room for all bits and
 /// [`POSITIONS_ROOM`]; returns their number. Eight a time, so that the processor need not guess how many are in a word.
 #[inline(always)]
-pub(super) fn positions(words: &[u64], after: usize, out: &mut Vec<u32>) -> usize {
+pub(super) fn positions(words: &[u64], after: Option<usize>, out: &mut Vec<u32>) -> usize {
     if out.len() < words.len() * 64 + POSITIONS_ROOM {
         out.resize(words.len() * 64 + POSITIONS_ROOM, 0);
     }
     let mut len = 0;
-    for w in after / 64..words.len() {
-        let mut rest = words[w];
-        if w == after / 64 {
+    for (w, &word) in words.iter().enumerate().skip(after.map_or(0, |k| k / 64)) {
+        let mut rest = word;
+        if let Some(after) = after
+            && w == after / 64
+        {
             rest &= !(u64::MAX >> (63 - after % 64));
         }
         let count = rest.count_ones() as usize;
@@ -314,11 +316,12 @@ mod tests {
         let words = [0x8000_0000_0000_0001, 0, 6, u64::MAX];
         let mut out = Vec::new();
         for (after, expected) in [(0, vec![63, 129, 130]), (62, vec![63, 129, 130]), (63, vec![129, 130])] {
-            let len = positions(&words, after, &mut out);
+            let len = positions(&words, Some(after), &mut out);
             assert_eq!(out[..expected.len()], expected[..]);
             assert_eq!(out[expected.len()..len], (192..256).collect::<Vec<_>>()[..]);
         }
-        assert_eq!(positions(&words, 255, &mut out), 0);
+        assert_eq!(positions(&words, None, &mut out), 68);
+        assert_eq!(positions(&words, Some(255), &mut out), 0);
     }
 
     #[test]

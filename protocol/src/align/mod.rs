@@ -17,6 +17,7 @@ mod accept;
 mod chance;
 mod consensus;
 mod covariance;
+mod density;
 mod evidence;
 mod graph;
 mod prepare;
@@ -31,7 +32,7 @@ mod tests;
 
 use crate::geometry::Relative;
 use crate::wire::fact::RefusalReason;
-pub use consensus::align;
+pub use consensus::{SigmaConsensus, align};
 use thiserror::Error;
 
 /// Matches a problem may hold; [`SolverConfig::points_max`] may lower it.

@@ -26,6 +26,8 @@ const EDGES_EXPANDED: usize = 256;
 const EDGES_EXPANDED_MIN: usize = 16;
 /// Triangles kept per expanded edge.
 const TRIANGLES_PER_EDGE: usize = 3;
+/// Third vertices tried per expanded edge; beyond, an even selection.
+const THIRDS_MAX: usize = 16;
 /// Candidates kept.
 pub(super) const CANDIDATES_MAX: usize = 6;
 /// Edge lengths may differ by this many √2 σ.
@@ -35,7 +37,7 @@ const HEIGHT_MIN: f64 = 3.0;
 /// A hypothesis is improved if its NFA is within this factor (ln) of the best raw one so far.
 const RAW_MARGIN: f64 = 7.0;
 /// Reweighted solves of a hypothesis, at most.
-const IMPROVEMENTS: usize = 3;
+const IMPROVEMENTS: usize = 4;
 /// A triangle is tried while at least this share of the best candidate's matches would agree with it: a structure of
 /// comparable size has such triangles.
 const COMMON_SHARE: f64 = 0.35;
@@ -49,6 +51,8 @@ const RADIUS: f64 = 2.0;
 pub(super) struct Step {
     /// Noise scale assumed, target units.
     pub sigma: f64,
+    /// Scales looked for.
+    pub scales: (f64, f64),
     /// Hypotheses scored at most.
     pub hypotheses_max: usize,
 }
@@ -75,6 +79,7 @@ pub(super) struct Sampler {
     edges: Vec<Edge>,
     triangles: Vec<Triangle>,
     common: Vec<u64>,
+    shared: Vec<u64>,
     source: Vec<Vector3<f64>>,
     target: Vec<Vector3<f64>>,
     weights: Vec<f64>,
@@ -113,6 +118,7 @@ impl Default for Sampler {
             edges: Vec::new(),
             triangles: Vec::new(),
             common: Vec::new(),
+            shared: Vec::new(),
             source: Vec::new(),
             target: Vec::new(),
             weights: Vec::new(),
@@ -135,7 +141,7 @@ impl Sampler {
         let tolerance = LENGTH_GATE * core::f64::consts::SQRT_2 * step.sigma;
         if context.with_scale {
             let per_scale = tolerance * context.sigma_max / step.sigma;
-            let vote = Vote { range: context.scale_range, tolerance, tolerance_per_scale: per_scale };
+            let vote = Vote { range: step.scales, tolerance, tolerance_per_scale: per_scale };
             self.scales.measure(self.arch, &self.cloud, &vote);
             let bins = self.scales.bins();
             for bin in 0..bins {
@@ -187,7 +193,7 @@ impl Sampler {
         let mut skip = 0;
         for i in 0..graph.count {
             let (row, share) = (graph.row(i), self.degrees[i] as f32 * inverse);
-            let neighbours = positions(row, i, &mut self.neighbours);
+            let neighbours = positions(row, Some(i), &mut self.neighbours);
             while skip < neighbours {
                 let j = self.neighbours[skip] as usize;
                 skip += stride;
@@ -228,23 +234,25 @@ impl Sampler {
             self.common.extend(graph.row(i).iter().zip(graph.row(j)).map(|(a, b)| a & b));
             let first = self.triangles.len();
             let expected = f64::from(self.degrees[i]) * f64::from(self.degrees[j]) * inverse;
-            for w in 0..graph.words {
-                let mut rest = self.kept.row(i)[w] & self.kept.row(j)[w];
-                while rest != 0 {
-                    let k = w * 64 + rest.trailing_zeros() as usize;
-                    rest &= rest - 1;
-                    let common = common(&self.common, graph.row(k));
-                    let mut vertices = [edge.i, edge.j, k as u32];
-                    vertices.sort_unstable();
-                    let surprise = Reverse(surprise(common, expected * f64::from(self.degrees[k])));
-                    let triangle = Triangle { surprise, common: Reverse(common), vertices };
-                    if self.triangles.len() - first < TRIANGLES_PER_EDGE {
-                        self.triangles.push(triangle);
-                    } else if let Some(worst) = self.triangles[first..].iter_mut().max()
-                        && triangle < *worst
-                    {
-                        *worst = triangle;
-                    }
+            self.shared.clear();
+            self.shared.extend_from_slice(self.kept.row(i));
+            for (shared, word) in self.shared.iter_mut().zip(self.kept.row(j)) {
+                *shared &= word;
+            }
+            let thirds = positions(&self.shared, None, &mut self.neighbours);
+            for k in (0..thirds).step_by(thirds.div_ceil(THIRDS_MAX).max(1)) {
+                let k = self.neighbours[k] as usize;
+                let common = common(&self.common, graph.row(k));
+                let mut vertices = [edge.i, edge.j, k as u32];
+                vertices.sort_unstable();
+                let surprise = Reverse(surprise(common, expected * f64::from(self.degrees[k])));
+                let triangle = Triangle { surprise, common: Reverse(common), vertices };
+                if self.triangles.len() - first < TRIANGLES_PER_EDGE {
+                    self.triangles.push(triangle);
+                } else if let Some(worst) = self.triangles[first..].iter_mut().max()
+                    && triangle < *worst
+                {
+                    *worst = triangle;
                 }
             }
         }
@@ -302,24 +310,30 @@ impl Sampler {
         (fits && (low..=high).contains(&motion.scale)).then_some(motion)
     }
 
-    /// Reweighted solves over the pool while the worth grows.
+    /// Reweighted solves over the pool while the worth grows: at the consensus' own radius, or else at twice that, which
+    /// leads out of the trap of a few true matches that chance ones have tilted.
     fn improve(&mut self, context: &Context, start: Candidate) -> Candidate {
         let mut best = start;
         for _ in 0..IMPROVEMENTS {
-            self.cloud.weights(self.arch, &best.motion, best.worth.radius / RADIUS, &mut self.weights);
-            let Some(motion) = solve::weighted(&self.source, &self.target, &self.weights, context.with_scale) else {
+            let near = best.worth.radius / RADIUS;
+            let Some(better) = self.resolve(context, &best, near).or_else(|| self.resolve(context, &best, 2.0 * near))
+            else {
                 break;
             };
-            if !(context.scale_range.0..=context.scale_range.1).contains(&motion.scale) {
-                break;
-            }
-            let worth = self.cloud.worth(self.arch, context, &motion, &mut self.tally);
-            if worth.score <= best.worth.score {
-                break;
-            }
-            best = Candidate { motion, worth };
+            best = better;
         }
         best
+    }
+
+    /// A solve with weights e^{−r²/2σ²}, if that is worth more.
+    fn resolve(&mut self, context: &Context, from: &Candidate, sigma: f64) -> Option<Candidate> {
+        self.cloud.weights(self.arch, &from.motion, sigma, &mut self.weights);
+        let motion = solve::weighted(&self.source, &self.target, &self.weights, context.with_scale)?;
+        if !(context.scale_range.0..=context.scale_range.1).contains(&motion.scale) {
+            return None;
+        }
+        let worth = self.cloud.worth(self.arch, context, &motion, &mut self.tally);
+        (worth.score > from.worth.score).then_some(Candidate { motion, worth })
     }
 
     /// Keeps a candidate, in place of the worst if full, and what it explains.
@@ -338,10 +352,11 @@ impl Sampler {
     }
 }
 
-/// −1000 ln of the Poisson tail's leading term: how unlikely so many common neighbours are where `expected` are.
+/// How unlikely so many common neighbours are where `expected` are: of two Poisson counts 1000 times the squared difference
+/// after the square root has made their variances equal (a quarter), which is near enough −1000 ln of the tail.
 fn surprise(common: u32, expected: f64) -> u32 {
-    let (count, expected) = (f64::from(common), expected.max(0.05));
-    if count > expected { (1000.0 * (count * libm::log(count / expected) - count + expected)) as u32 } else { 0 }
+    let excess = f64::from(common).sqrt() - expected.max(0.05).sqrt();
+    if excess > 0.0 { (4000.0 * excess * excess) as u32 } else { 0 }
 }
 
 /// Height of a triangle over its longest edge.
