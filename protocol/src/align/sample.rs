@@ -1,10 +1,11 @@
 //! Hypotheses from triangles of matches whose edge lengths agree.
 //!
 //! A rigid motion keeps lengths, so true matches are mutually compatible: they form a dense part of the compatibility
-//! graph, kept as bitsets. Edges are ranked by their common neighbours, triangles by theirs, so that even ten true among a
-//! thousand matches are among the first hypotheses. For SIM(3) the graph is built per narrow range of scale. Each
-//! hypothesis is scored by the MAGSAC++ loss in closed form (n = 3: 1 − e^{−x} − c x), improved by two reweighted solves,
-//! and triangles that a kept hypothesis explains are skipped: the candidates are distinct.
+//! graph, kept as bitsets. Edges whose ends have no more common neighbours than chance gives are dropped, and the common
+//! neighbours of the rest counted again among the rest: even ten true among a thousand matches then stand alone. For SIM(3)
+//! there is a graph per narrow bin of scale ([`super::scales`]). Each triangle's motion is worth its own number of false
+//! alarms ([`super::tally`]), is improved by reweighted solves, and spares the triangles it explains: candidates are
+//! distinct.
 
 use super::graph::{Cloud, Graph, common, positions, wide};
 use super::refine::Context;
@@ -281,14 +282,19 @@ impl Sampler {
             if worth.score < best_raw - RAW_MARGIN {
                 continue;
             }
-            let candidate = self.improve(context, Candidate { motion, worth });
-            let score = candidate.worth.score;
-            if out.len() < CANDIDATES_MAX || out.iter().any(|c| c.worth.score < score) {
-                if score > best.score {
-                    best = candidate.worth;
-                }
-                self.keep(candidate, out);
+            let candidate = self.improve(context, Candidate { motion, worth }, &[1.0]);
+            if !kept_by(out, &candidate, RAW_MARGIN) {
+                continue;
             }
+            // A few true matches that chance ones have tilted are led out of that trap by a wider view.
+            let candidate = self.improve(context, candidate, &[1.0, 2.0]);
+            if !kept_by(out, &candidate, 0.0) {
+                continue;
+            }
+            if candidate.worth.score > best.score {
+                best = candidate.worth;
+            }
+            self.keep(candidate, out);
         }
     }
 
@@ -310,16 +316,13 @@ impl Sampler {
         (fits && (low..=high).contains(&motion.scale)).then_some(motion)
     }
 
-    /// Reweighted solves over the pool while the worth grows: at the consensus' own radius, or else at twice that, which
-    /// leads out of the trap of a few true matches that chance ones have tilted.
-    fn improve(&mut self, context: &Context, start: Candidate) -> Candidate {
+    /// Reweighted solves over the pool while the worth grows, at the first of these multiples of the consensus' radius at
+    /// which it does.
+    fn improve(&mut self, context: &Context, start: Candidate, multiples: &[f64]) -> Candidate {
         let mut best = start;
         for _ in 0..IMPROVEMENTS {
             let near = best.worth.radius / RADIUS;
-            let Some(better) = self.resolve(context, &best, near).or_else(|| self.resolve(context, &best, 2.0 * near))
-            else {
-                break;
-            };
+            let Some(better) = multiples.iter().find_map(|m| self.resolve(context, &best, m * near)) else { break };
             best = better;
         }
         best
@@ -350,6 +353,11 @@ impl Sampler {
         let reach = EXPLAINED * candidate.worth.radius;
         self.cloud.near(self.arch, &candidate.motion, reach, &mut self.explained[slot]);
     }
+}
+
+/// Whether a candidate is among the best, or would be with a score better by `margin`.
+fn kept_by(out: &[Candidate], candidate: &Candidate, margin: f64) -> bool {
+    out.len() < CANDIDATES_MAX || out.iter().any(|c| c.worth.score < candidate.worth.score + margin)
 }
 
 /// How unlikely so many common neighbours are where `expected` are: of two Poisson counts 1000 times the squared difference

@@ -10,7 +10,7 @@ use pulp::Arch;
 /// Bins at most: a bin's number is a byte.
 const BINS_MAX: usize = 240;
 /// Width of a bin over that of a typical pair's half vote.
-const WIDTH: f64 = 3.0;
+const WIDTH: f64 = 4.0;
 /// Pairs shorter than so many τ vote for nearly everything and are left out.
 const LENGTH_MIN: f32 = 3.0;
 /// The bins of every ordered pair.
