@@ -35,9 +35,6 @@ fn alignments(c: &mut Criterion) {
         for (n, inliers) in
             [(100, 50), (100, 10), (300, 20), (300, 0), (1000, 500), (1000, 50), (1000, 10), (5000, 2500)]
         {
-            if model != rigid && inliers <= 10 {
-                continue;
-            }
             let (source, target) = matches(n, inliers);
             let config = SolverConfig { model, sigma_max: 3.0 * SIGMA, ..SolverConfig::default() };
             group.bench_function(BenchmarkId::new(name, format!("{inliers}_of_{n}")), |b| {
@@ -49,13 +46,30 @@ fn alignments(c: &mut Criterion) {
     group.finish();
 }
 
-fn kernel_density(c: &mut Criterion) {
-    let samples: Vec<f64> = (0..500).map(|k| 0.02 * f64::from(k) / 500.0).collect();
-    c.bench_function("kde/direct_500", |b| b.iter(|| kde_weight(black_box(0.01), &samples, SIGMA)));
-    let mut density = NormDensity::default();
-    density.set(samples.iter().copied());
-    c.bench_function("kde/table_500", |b| b.iter(|| density.at(black_box(0.01), SIGMA)));
+/// Ten times the true σ as its bound.
+fn generous_bound(c: &mut Criterion) {
+    let mut group = c.benchmark_group("align_10_sigma");
+    group.sample_size(20);
+    for (n, inliers) in [(100, 10), (1000, 50), (1000, 10)] {
+        let (source, target) = matches(n, inliers);
+        let config = SolverConfig { sigma_max: 10.0 * SIGMA, ..SolverConfig::default() };
+        group.bench_function(BenchmarkId::new("se3", format!("{inliers}_of_{n}")), |b| {
+            let problem = Problem { source: &source, target: &target, scores: None };
+            b.iter(|| black_box(align(&problem, &config).unwrap()));
+        });
+    }
+    group.finish();
 }
 
-criterion_group!(benches, alignments, kernel_density);
+fn kernel_density(c: &mut Criterion) {
+    for n in [500, 5000] {
+        let samples: Vec<f64> = (0..n).map(|k| 0.03 * f64::from(k) / f64::from(n)).collect();
+        c.bench_function(&format!("kde/direct_{n}"), |b| b.iter(|| kde_weight(black_box(0.01), &samples, SIGMA)));
+        let mut density = NormDensity::default();
+        c.bench_function(&format!("kde/tree_{n}_build"), |b| b.iter(|| density.set(samples.iter().copied())));
+        c.bench_function(&format!("kde/tree_{n}"), |b| b.iter(|| density.at(black_box(0.01), SIGMA)));
+    }
+}
+
+criterion_group!(benches, alignments, generous_bound, kernel_density);
 criterion_main!(benches);

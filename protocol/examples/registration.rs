@@ -115,6 +115,12 @@ fn run(case: &Case, config: &SolverConfig, cell: &mut Cell) {
             let scale = (sim.scale / case.truth.scale - 1.0).abs();
             if rotation > 5.0 || translation > 0.1 || scale > 0.1 {
                 cell.wrong += 1;
+                if found.standing == Standing::Accepted {
+                    println!(
+                        "wrong accepted: {rotation:.2} deg, {translation:.3}, scale {scale:.3} of {:.3}, log10 NFA {:.1}, support {:.1}, sigma {:.4}",
+                        case.truth.scale, found.log10_nfa, found.support, found.sigma
+                    );
+                }
                 cell.wrong_accepted += usize::from(found.standing == Standing::Accepted);
                 return;
             }

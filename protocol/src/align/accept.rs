@@ -1,9 +1,10 @@
 //! Whether a consensus could be chance: the number of false alarms (NFA), the expected number of equally good alignments
 //! in random matches (MATH §4.3).
 //!
-//! `NFA = (n − 3) C(n, k) π₃ α^(k − 3)`: α is the chance that a random target lies within the k-th smallest residual of
+//! `NFA = (k − 3)(k − 2) C(n, k) π₃ α^(k − 3)`: α is the chance that a random target lies within the k-th smallest residual of
 //! a given place, and π₃ the chance that a random triangle is rigid to that accuracy at all; both are measured on the
-//! problem ([`super::chance`]). MATH's C(k, 3) is absent: it counts each subset once for each of its triangles. Evidence is
+//! problem ([`super::chance`]). The first factors share the false alarms out among the k tried: Σ 1/((k − 3)(k − 2)) is 1 from
+//! k = 4 on, as is the sum of MATH's 1/(n − 3) over all k, but a small consensus is the one in doubt. MATH's C(k, 3) is absent: it counts each subset once for each of its triangles. Evidence is
 //! not used: on pure outliers it accepts 76–100 % (*measured*).
 
 use super::prepare::Matches;
@@ -13,7 +14,7 @@ use libm::{log, log10};
 /// Fewest matches that can be significant.
 pub(super) const COUNT_MIN: usize = 5;
 /// Residuals beyond this many σ_max cannot be inliers: the 99 % quantile of χ₃.
-const REACH: f64 = 3.368_2;
+pub(super) const REACH: f64 = 3.368_2;
 
 /// Points closer than so many σ̂ are one piece of evidence.
 const SEPARATION: f64 = 2.0;
@@ -60,7 +61,8 @@ pub(super) fn significance(
         }
         let r = fit.squared[i as usize].sqrt().max(floor) * unit;
         let (rigid, alpha) = (matches.chance.rigid_triangle(2.0 * r), matches.chance.alpha(r));
-        let log10_nfa = (log(n_f - 3.0) + choose + log(rigid) + drawn * log(alpha)) * core::f64::consts::LOG10_E;
+        let log10_nfa =
+            (log(drawn * (drawn + 1.0)) + choose + log(rigid) + drawn * log(alpha)) * core::f64::consts::LOG10_E;
         if log10_nfa < best.log10_nfa {
             best = Significance { log10_nfa, count: rank + 1 };
         }

@@ -8,17 +8,27 @@ use super::refine::{self, Context, Fit};
 use super::sample::{Candidate, Sampler, Step};
 use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig, Standing};
 
-/// Size of the first prefix of matches searched; each next is four times as large.
+/// Size of the first prefix of matches searched.
 const PREFIX_FIRST: usize = 128;
+/// Each next prefix is larger by this factor: rigid, with scale. The costlier the search, the finer the steps.
+const PREFIX_GROWTH: [usize; 2] = [4, 2];
+/// Largest prefix searched: rigid, with scale. Bounds time and memory, which grow with its square and worse.
+const PREFIX_LARGEST: [usize; 2] = [8192, 2048];
 /// σ levels: σ_max over 1, 2, 4, 8, 16.
 const LEVELS: u32 = 5;
 /// Relative cost of a level, or doubt that it is the right one: σ_max is commonly 3–10 × the truth, and the tighter
 /// graph is the cheaper.
-const LEVEL_COSTS: [usize; LEVELS as usize] = [20, 10, 4, 4, 8];
+const LEVEL_COSTS: [usize; LEVELS as usize] = [16, 5, 4, 6, 10];
 /// Candidates evaluated on all matches, per step.
 const EVALUATED: usize = 3;
+/// A candidate whose log₁₀ NFA in a prefix is beyond this is not evaluated,
+const PREFIX_MAX: f64 = 2.5;
+/// nor one that is so far from the bar on all matches.
+const WHOLE_MARGIN: f64 = 3.0;
 /// Matches of a rival expected in the prefix in which it is sought.
-const RIVAL_EXPECTED: f64 = 20.0;
+const RIVAL_EXPECTED: f64 = 14.0;
+/// Motions whose scales differ by more than this factor do not share pairs of matches.
+const RIVAL_SCALE: f64 = 1.2;
 /// An inlier lies within so many σ̂: the 99 % quantile of χ₃, and a margin.
 const INLIER_REACH: f64 = 4.0;
 
@@ -31,6 +41,34 @@ const INLIER_REACH: f64 = 4.0;
 pub fn align(problem: &Problem, config: &SolverConfig) -> Result<Result<Alignment, Refusal>, AlignError> {
     let matches = prepare::prepare(problem, config)?;
     Ok(Search::new(&matches, config).run())
+}
+
+/// The estimator with its settings, checked once: [`align`] as a value.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SigmaConsensus {
+    config: SolverConfig,
+}
+
+impl SigmaConsensus {
+    /// # Errors
+    /// [`AlignError::BadConfig`], naming the first setting out of range.
+    pub fn new(config: SolverConfig) -> Result<Self, AlignError> {
+        config.check()?;
+        Ok(Self { config })
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &SolverConfig {
+        &self.config
+    }
+
+    /// See [`align`].
+    ///
+    /// # Errors
+    /// [`AlignError`] if the problem is malformed.
+    pub fn solve(&self, problem: &Problem) -> Result<Result<Alignment, Refusal>, AlignError> {
+        align(problem, &self.config)
+    }
 }
 
 /// A fit that was evaluated on all matches.
@@ -109,8 +147,8 @@ impl<'a> Search<'a> {
     fn first_accepted(&mut self, pool: &[u32]) -> Option<(Evaluated, Stage)> {
         let bar = self.config.log10_nfa_provisional.unwrap_or(self.config.log10_nfa_max);
         let mut best: Option<(Evaluated, Stage)> = None;
-        for stage in stages(pool.len()) {
-            let Some(found) = self.step(pool, stage, bar, None) else { continue };
+        for stage in stages(pool.len(), self.context.with_scale) {
+            let Some(found) = self.step(pool, stage, self.context.scale_range, bar, None) else { continue };
             let nfa = found.significance.log10_nfa;
             if best.as_ref().is_none_or(|(b, _)| nfa < b.significance.log10_nfa) {
                 best = Some((found, stage));
@@ -122,15 +160,35 @@ impl<'a> Search<'a> {
         best
     }
 
-    /// One prefix at one σ level: the best fit with log₁₀ NFA up to `bar`. Matches in `taken` do not count.
-    fn step(&mut self, pool: &[u32], stage: Stage, bar: f64, taken: Option<&[bool]>) -> Option<Evaluated> {
+    /// One prefix at one σ level, for scales within `scales`: the best fit with log₁₀ NFA up to `bar`. Matches in `taken` do
+    /// not count.
+    fn step(
+        &mut self,
+        pool: &[u32],
+        stage: Stage,
+        scales: (f64, f64),
+        bar: f64,
+        taken: Option<&[bool]>,
+    ) -> Option<Evaluated> {
         let sigma = self.config.sigma_max / f64::from(1_u32 << stage.level);
         let prefix = &pool[..stage.prefix.min(pool.len())];
-        let step = Step { sigma, hypotheses_max: self.config.hypotheses_max };
+        let step = Step { sigma, scales, hypotheses_max: self.config.hypotheses_max };
         let mut candidates = core::mem::take(&mut self.candidates);
         self.sampler.propose(&self.context, prefix, &step, &mut candidates);
+        self.candidates = candidates;
+        let whole = prefix.len() == self.context.matches.len();
+        let hopeless = if whole { bar + WHOLE_MARGIN } else { PREFIX_MAX };
+        self.best_candidate(EVALUATED, hopeless, bar, taken)
+    }
+
+    /// The best fit of the first `count` candidates with log₁₀ NFA up to `bar`.
+    fn best_candidate(&mut self, count: usize, hopeless: f64, bar: f64, taken: Option<&[bool]>) -> Option<Evaluated> {
+        let candidates = core::mem::take(&mut self.candidates);
         let mut best: Option<Evaluated> = None;
-        for candidate in candidates.iter().take(EVALUATED) {
+        for candidate in candidates.iter().take(count) {
+            if -candidate.worth.score * core::f64::consts::LOG10_E > hopeless {
+                break;
+            }
             let Some(found) = self.evaluate(candidate, bar, taken) else { continue };
             if best.as_ref().is_none_or(|b| found.significance.log10_nfa < b.significance.log10_nfa) {
                 best = Some(found);
@@ -162,7 +220,7 @@ impl<'a> Search<'a> {
     }
 
     /// The best significant fit that shares no match with `best`: sought on a prefix in which a rival of weight has
-    /// [`RIVAL_EXPECTED`] matches, at the σ level that found `best` and the next looser one.
+    /// [`RIVAL_EXPECTED`] matches, at the σ level that found `best`, since both come from the same noise.
     fn rival(&mut self, best: &Evaluated, stage: Stage) -> Option<Evaluated> {
         let reach = INLIER_REACH * best.fit.sigma;
         let taken: Vec<bool> = best.fit.squared.iter().map(|r2| *r2 < reach * reach).collect();
@@ -171,10 +229,23 @@ impl<'a> Search<'a> {
         if (pool.len() as f64) < weight || pool.len() < COUNT_MIN {
             return None;
         }
-        let prefix = ((RIVAL_EXPECTED / weight * pool.len() as f64) as usize).max(stage.prefix);
         let bar = best.significance.log10_nfa.max(self.config.log10_nfa_max);
-        let looser = stage.level.saturating_sub(1);
-        (looser..=stage.level).rev().find_map(|level| self.step(&pool, Stage { prefix, level }, bar, Some(&taken)))
+        let enough = ((RIVAL_EXPECTED / weight * pool.len() as f64) as usize).min(pool.len());
+        let mut scales = self.context.scale_range;
+        let accepted = best.significance.log10_nfa <= self.config.log10_nfa_max;
+        if self.context.with_scale && accepted && enough <= stage.prefix {
+            // The step that found `best` looked for motions of each scale apart: one of another scale is among its
+            // candidates. Only near its own scale may `best` have crowded out a rival.
+            let other = self.best_candidate(usize::MAX, bar + WHOLE_MARGIN, bar, Some(&taken));
+            if other.is_some() {
+                return other;
+            }
+            let scale = best.fit.motion.scale;
+            scales = (scales.0.max(scale / RIVAL_SCALE), scales.1.min(scale * RIVAL_SCALE));
+        }
+        let largest = PREFIX_LARGEST[usize::from(self.context.with_scale)];
+        let prefix = enough.max(stage.prefix).min(largest);
+        self.step(&pool, Stage { prefix, level: stage.level }, scales, bar, Some(&taken))
     }
 
     fn conclude(&mut self, best: Evaluated) -> Result<Alignment, Refusal> {
@@ -202,9 +273,11 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Prefixes 128, 512, … and all, each at every σ level, cheapest and likeliest first.
-fn stages(n: usize) -> Vec<Stage> {
-    let growing = core::iter::successors(Some(PREFIX_FIRST), |p| p.checked_mul(4));
+/// Growing prefixes, each at every σ level, cheapest and likeliest first.
+fn stages(n: usize, with_scale: bool) -> Vec<Stage> {
+    let kind = usize::from(with_scale);
+    let n = n.min(PREFIX_LARGEST[kind]);
+    let growing = core::iter::successors(Some(PREFIX_FIRST), |p| p.checked_mul(PREFIX_GROWTH[kind]));
     let prefixes = growing.take_while(|p| p * 3 / 2 < n).chain([n]);
     let mut stages: Vec<Stage> =
         prefixes.flat_map(|prefix| (0..LEVELS).map(move |level| Stage { prefix, level })).collect();

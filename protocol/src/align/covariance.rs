@@ -2,10 +2,13 @@
 //!
 //! A local perturbation moves `s R p + t` by `J δ`, J = s R [I, −p^, p] (the last column for SIM(3) only). At the inliers'
 //! centroid the information Σ w JᵀJ / σ̂² falls apart into translation, rotation and scale; the result is carried to the
-//! source origin by Ad. w = p (1 − (1 − p) r² / 3σ²) is the expected curvature of the mixture's log-likelihood: matches
-//! of doubtful membership inform less. The covariance is inflated so that its χ² ellipsoid covers 95 % although σ̂ is
+//! source origin by Ad. w = p + r p′(r) / 3 is the mean slope of the estimator's influence p r at a match, for the Gaussian
+//! mixture p (1 − (1 − p) r² / 3σ²): matches of doubtful membership inform less. How widely the influences really scatter,
+//! Σ p² r², scales the covariance (A⁻¹ B A⁻¹ of robust statistics): under Gaussian noise it adds nothing, under heavy
+//! tails it is what keeps the covariance honest. The covariance is inflated so that its χ² ellipsoid covers 95 % although σ̂ is
 //! estimated from ν = 3 Σp − dof residuals.
 
+use super::Weighting;
 use super::refine::{Context, Fit};
 use crate::geometry::so3::hat;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
@@ -13,6 +16,9 @@ use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 
 /// Degrees of freedom of σ̂² assumed at least.
 const FREEDOM_MIN: f64 = 4.0;
+
+/// The scatter of influences lowers the covariance to this share at most.
+const HONEST_MIN: f64 = 0.8;
 
 /// An alignment with its uncertainty.
 #[derive(Clone, Debug)]
@@ -78,28 +84,55 @@ pub(super) fn estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
 fn information(context: &Context, fit: &Fit) -> Information {
     let unit = fit.motion.residual_unit();
     let variance = fit.sigma * fit.sigma;
-    let weight = |i: usize| {
-        let p = fit.probabilities[i];
-        p * (1.0 - (1.0 - p) * fit.squared[i] / (3.0 * variance))
-    };
-    let inliers = || (0..fit.probabilities.len()).filter(|&i| fit.probabilities[i] > 0.0);
-    let total: f64 = inliers().map(weight).sum();
-    // Curvature may turn negative in hopeless mixtures; then fall back to the plain posteriors, and say as little.
+    let mut weights = slopes(fit);
     let plain: f64 = fit.support();
-    let curved = total > 0.5 * plain;
-    let weight = |i: usize| if curved { weight(i) } else { 0.5 * fit.probabilities[i] };
-    let total = if curved { total } else { 0.5 * plain };
-    let source = &context.matches.source;
-    let centroid = inliers().map(|i| source[i] * weight(i)).sum::<Vector3<f64>>() / total;
-    let (mut scatter, mut spread) = (Matrix3::zeros(), 0.0);
-    for i in inliers() {
-        let x = source[i] - centroid;
-        scatter += x * x.transpose() * weight(i);
-        spread += x.norm_squared() * weight(i);
+    let mut total: f64 = weights.iter().map(|(_, w)| w).sum();
+    if total < 0.5 * plain {
+        // The slope may turn negative in hopeless mixtures; then fall back to the plain posteriors, and say as little.
+        weights.iter_mut().for_each(|(i, w)| *w = 0.5 * fit.probabilities[*i]);
+        total = 0.5 * plain;
     }
-    let k = motion_gain(fit.motion.scale, unit, variance);
+    let influence = |i: usize| fit.probabilities[i] * fit.probabilities[i] * fit.squared[i];
+    let freedom = (3.0 * plain - context.dof()).max(FREEDOM_MIN);
+    let scatter_of_influence = weights.iter().map(|(i, _)| influence(*i)).sum::<f64>() / (3.0 * variance);
+    let honest = total / (scatter_of_influence * 3.0 * plain / freedom).max(HONEST_MIN * total);
+    let source = &context.matches.source;
+    let centroid = weights.iter().map(|(i, w)| source[*i] * *w).sum::<Vector3<f64>>() / total;
+    let (mut scatter, mut spread) = (Matrix3::zeros(), 0.0);
+    for (i, w) in &weights {
+        let x = source[*i] - centroid;
+        scatter += x * x.transpose() * *w;
+        spread += x.norm_squared() * *w;
+    }
+    let k = motion_gain(fit.motion.scale, unit, variance) * honest;
     let rotation = (Matrix3::identity() * spread - scatter) * k;
     Information { centroid, translation: total * k, rotation, scale: spread * k }
+}
+
+/// Matches of positive probability with the mean slope of their influence.
+fn slopes(fit: &Fit) -> Vec<(usize, f64)> {
+    let variance = fit.sigma * fit.sigma;
+    let mut inliers: Vec<(usize, f64)> =
+        (0..fit.probabilities.len()).filter(|&i| fit.probabilities[i] > 0.0).map(|i| (i, 0.0)).collect();
+    if fit.weighting != Weighting::Kde {
+        for (i, w) in &mut inliers {
+            let p = fit.probabilities[*i];
+            *w = p * (1.0 - (1.0 - p) * fit.squared[*i] / (3.0 * variance));
+        }
+        return inliers;
+    }
+    // p(r) is known at the residuals only: its slope is that between residuals some ranks apart.
+    inliers.sort_unstable_by(|a, b| fit.squared[a.0].total_cmp(&fit.squared[b.0]).then(a.0.cmp(&b.0)));
+    let window = (inliers.len() / 20).max(4);
+    for k in 0..inliers.len() {
+        let (low, high) = (inliers[k.saturating_sub(window)].0, inliers[(k + window).min(inliers.len() - 1)].0);
+        let run = fit.squared[high].sqrt() - fit.squared[low].sqrt();
+        let rise = fit.probabilities[high] - fit.probabilities[low];
+        let p = fit.probabilities[inliers[k].0];
+        let slope = if run > 0.0 { rise / run } else { 0.0 };
+        inliers[k].1 = (p + fit.squared[inliers[k].0].sqrt() * slope / 3.0).clamp(-1.0, 1.0);
+    }
+    inliers
 }
 
 /// s² / σ² with σ in target units.

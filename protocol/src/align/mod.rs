@@ -2,12 +2,14 @@
 //! similarity with a calibrated covariance, or to a refusal that says why.
 //!
 //! The noise scale σ is not told, only bounded by `sigma_max`; it is marginalised in each step (MATH §4):
-//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree, ranked by how many further matches
-//!    agree with them, on nested prefixes of the matches (best scores first) and σ levels from tight to loose.
-//! 2. `evidence` scores them by the evidence of a Gaussian-inlier, uniform-outlier mixture over ten σ.
+//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree (`graph`; for SIM(3) at one scale,
+//!    `scales`), ranked by how many further matches agree with them, on nested prefixes of the matches (best scores first)
+//!    and σ levels from tight to loose; `tally` prescores each by its own number of false alarms over all radii.
+//! 2. `evidence` starts the refinement at the σ of highest evidence, of a Gaussian-inlier, uniform-outlier mixture.
 //! 3. `refine` polishes by expectation-maximisation, then by the kernel density weights S(12)–S(30) of [`sigma`] where
 //!    they predict held-out residuals better.
-//! 4. `accept` admits by number of false alarms (`chance` measures what chance does), never by evidence; a disjoint rival makes the answer ambiguous.
+//! 4. `accept` admits by number of false alarms (`chance` measures what chance does), never by evidence; a disjoint rival
+//!    makes the answer ambiguous.
 //! 5. `covariance` states what is known, and refuses geometry that leaves a direction undetermined.
 //!
 //! Everything is a function of the *set* of matches and the seed: matches are sorted first, so their order changes
@@ -17,18 +19,22 @@ mod accept;
 mod chance;
 mod consensus;
 mod covariance;
+mod density;
 mod evidence;
+mod graph;
 mod prepare;
 mod refine;
 mod sample;
+mod scales;
 pub mod sigma;
 mod solve;
+mod tally;
 #[cfg(test)]
 mod tests;
 
 use crate::geometry::Relative;
 use crate::wire::fact::RefusalReason;
-pub use consensus::align;
+pub use consensus::{SigmaConsensus, align};
 use thiserror::Error;
 
 /// Matches a problem may hold; [`SolverConfig::points_max`] may lower it.

@@ -17,8 +17,6 @@ const EM_TOLERANCE: f64 = 1e-7;
 const KDE_ITERATIONS: usize = 8;
 /// Residuals the kernel density is made of: those within this many σ̂.
 const KDE_REACH: f64 = 8.0;
-/// At most so many (evenly spaced order statistics beyond).
-const KDE_SAMPLES_MAX: usize = 512;
 /// The standard deviation of a χ₃ norm, in σ: the spread that bounds the kernel density's bandwidth.
 const CHI3_SPREAD: f64 = 0.673_4;
 /// Support below which a density of residuals says little.
@@ -204,7 +202,7 @@ fn kernel_density(context: &Context, start: &Fit, scratch: &mut Scratch) -> Opti
         let mut ceiling = 1.0_f64;
         for (k, &i) in scratch.order.iter().enumerate() {
             let r = fit.squared[i as usize].sqrt();
-            let density = share * density_without(&scratch.density, k, inside, r, spread);
+            let density = share * scratch.density.at_sample(k, spread);
             let shell = outlier_shell(r.max(0.5 * fit.sigma), (1.0 - fit.inlier_share).max(1e-3), context.volume);
             let p = if density > 0.0 { (1.0 - shell / density).clamp(0.0, 1.0) } else { 0.0 };
             if r >= fit.sigma {
@@ -228,29 +226,8 @@ fn gather(fit: &Fit, scratch: &mut Scratch) -> usize {
     scratch.order.clear();
     scratch.order.extend((0..squared.len() as u32).filter(|&i| squared[i as usize] < reach));
     scratch.order.sort_unstable_by(|&a, &b| squared[a as usize].total_cmp(&squared[b as usize]).then(a.cmp(&b)));
-    let inside = scratch.order.len();
-    let kept = inside.min(KDE_SAMPLES_MAX);
-    let order = &scratch.order;
-    scratch.density.set((0..kept).map(|k| squared[order[sample_rank(k, inside)] as usize].sqrt()));
-    inside
-}
-
-/// Rank of the k-th sample among `inside` residuals.
-fn sample_rank(k: usize, inside: usize) -> usize {
-    if inside <= KDE_SAMPLES_MAX { k } else { k * inside / KDE_SAMPLES_MAX }
-}
-
-/// Kernel density at the residual of rank `k`, leaving that residual out.
-fn density_without(density: &NormDensity, k: usize, inside: usize, r: f64, spread: f64) -> f64 {
-    if inside <= KDE_SAMPLES_MAX {
-        return density.at_sample(k, spread);
-    }
-    let sample = (k * KDE_SAMPLES_MAX).div_ceil(inside);
-    if sample < KDE_SAMPLES_MAX && sample_rank(sample, inside) == k {
-        density.at_sample(sample, spread)
-    } else {
-        density.at(r, spread)
-    }
+    scratch.density.set(scratch.order.iter().map(|&i| squared[i as usize].sqrt()));
+    scratch.order.len()
 }
 
 /// Density of an outlier's residual norm.
@@ -268,7 +245,7 @@ fn held_out_gain(context: &Context, fit: &Fit, scratch: &mut Scratch) -> f64 {
     for (k, &i) in scratch.order.iter().enumerate() {
         let (r2, p) = (fit.squared[i as usize], fit.probabilities[i as usize]);
         let r = r2.sqrt();
-        let kernel = inside as f64 / n * density_without(&scratch.density, k, inside, r, spread);
+        let kernel = inside as f64 / n * scratch.density.at_sample(k, spread);
         // σ̂² without this match.
         let variance = fit.sigma * fit.sigma;
         let left = ((freedom * variance - p * r2) / (freedom - 3.0 * p).max(1.0)).max(0.1 * variance);

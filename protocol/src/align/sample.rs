@@ -1,49 +1,59 @@
 //! Hypotheses from triangles of matches whose edge lengths agree.
 //!
 //! A rigid motion keeps lengths, so true matches are mutually compatible: they form a dense part of the compatibility
-//! graph, kept as bitsets. Edges are ranked by their common neighbours, triangles by theirs, so that even ten true among a
-//! thousand matches are among the first hypotheses. For SIM(3) the graph is built per narrow range of scale. Each
-//! hypothesis is scored by the MAGSAC++ loss in closed form (n = 3: 1 − e^{−x} − c x), improved by two reweighted solves,
-//! and triangles that a kept hypothesis explains are skipped: the candidates are distinct.
+//! graph, kept as bitsets. Edges whose ends have no more common neighbours than chance gives are dropped, and the common
+//! neighbours of the rest counted again among the rest: even ten true among a thousand matches then stand alone. For SIM(3)
+//! there is a graph per narrow bin of scale ([`super::scales`]). Each triangle's motion is worth its own number of false
+//! alarms ([`super::tally`]), is improved by reweighted solves, and spares the triangles it explains: candidates are
+//! distinct.
 
-use super::prepare::Matches;
+use super::graph::{Cloud, Graph, common, positions, wide};
 use super::refine::Context;
+use super::scales::{Scales, Vote};
 use super::solve::{self, Motion};
+use super::tally::{Tally, Worth};
 use core::cmp::Reverse;
-use libm::exp;
 use nalgebra::Vector3;
+use pulp::Arch;
 
-/// Edges whose common neighbours are counted, at most, in all graphs of a step; beyond, an even selection.
-const EDGES_MAX: usize = 65_536;
-/// ...and in each of them at least.
-const EDGES_MIN: usize = 8_192;
+/// Edges whose common neighbours are counted, at most, in one graph; beyond, an even selection.
+const EDGES_MAX: usize = 262_144;
+/// An edge is kept if its ends have this many standard deviations more common neighbours than their degrees explain, or if
+/// they share most: where nearly all matches are true, degrees explain everything.
+const EXCESS_MIN: f32 = 1.0;
 /// Edges expanded to triangles, in all graphs of a step.
 const EDGES_EXPANDED: usize = 256;
 /// ...and at least, in each of them.
-const EDGES_EXPANDED_MIN: usize = 32;
+const EDGES_EXPANDED_MIN: usize = 16;
 /// Triangles kept per expanded edge.
 const TRIANGLES_PER_EDGE: usize = 3;
+/// Third vertices tried per expanded edge; beyond, an even selection.
+const THIRDS_MAX: usize = 16;
 /// Candidates kept.
 pub(super) const CANDIDATES_MAX: usize = 6;
-/// Half the squared 99 % quantile of χ₃.
-const EXPONENT_GATE: f64 = 0.5 * 3.368_2 * 3.368_2;
 /// Edge lengths may differ by this many √2 σ.
 const LENGTH_GATE: f64 = 2.0;
 /// A triangle's height over its longest edge, in σ, from which its motion is worth something.
 const HEIGHT_MIN: f64 = 3.0;
-/// A hypothesis is improved if it scores this share of the best raw score so far.
-const RAW_SHARE: f64 = 0.75;
+/// A hypothesis is improved if its NFA is within this factor (ln) of the best raw one so far.
+const RAW_MARGIN: f64 = 7.0;
+/// Reweighted solves of a hypothesis, at most.
+const IMPROVEMENTS: usize = 4;
 /// A triangle is tried while at least this share of the best candidate's matches would agree with it: a structure of
 /// comparable size has such triangles.
 const COMMON_SHARE: f64 = 0.35;
-/// Ratio of the largest to the smallest scale of one graph.
-const SCALE_STEP: f64 = 1.1;
+/// A match within so many times a candidate's radius is explained by it.
+const EXPLAINED: f64 = 1.25;
+/// A consensus' radius is about so many σ.
+const RADIUS: f64 = 2.0;
 
 /// One search step.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Step {
     /// Noise scale assumed, target units.
     pub sigma: f64,
+    /// Scales looked for.
+    pub scales: (f64, f64),
     /// Hypotheses scored at most.
     pub hypotheses_max: usize,
 }
@@ -52,16 +62,25 @@ pub(super) struct Step {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Candidate {
     pub motion: Motion,
-    pub score: f64,
+    pub worth: Worth,
 }
 
 /// Buffers reused over steps.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Sampler {
+    arch: Arch,
+    cloud: Cloud,
+    tally: Tally,
+    scales: Scales,
     graph: Graph,
+    /// The edges of `graph` with more common neighbours than chance gives.
+    kept: Graph,
+    degrees: Vec<u32>,
+    neighbours: Vec<u32>,
     edges: Vec<Edge>,
     triangles: Vec<Triangle>,
     common: Vec<u64>,
+    shared: Vec<u64>,
     source: Vec<Vector3<f64>>,
     target: Vec<Vector3<f64>>,
     weights: Vec<f64>,
@@ -69,9 +88,10 @@ pub(super) struct Sampler {
     explained: Vec<Vec<u64>>,
 }
 
-/// Ordered by most common neighbours.
+/// Ordered by most common neighbours among kept edges, then among all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Edge {
+    kept: Reverse<u32>,
     common: Reverse<u32>,
     i: u32,
     j: u32,
@@ -85,6 +105,29 @@ struct Triangle {
     vertices: [u32; 3],
 }
 
+impl Default for Sampler {
+    fn default() -> Self {
+        Self {
+            arch: Arch::new(),
+            cloud: Cloud::default(),
+            tally: Tally::default(),
+            scales: Scales::default(),
+            graph: Graph::default(),
+            kept: Graph::default(),
+            degrees: Vec::new(),
+            neighbours: Vec::new(),
+            edges: Vec::new(),
+            triangles: Vec::new(),
+            common: Vec::new(),
+            shared: Vec::new(),
+            source: Vec::new(),
+            target: Vec::new(),
+            weights: Vec::new(),
+            explained: Vec::new(),
+        }
+    }
+}
+
 impl Sampler {
     /// The best distinct motions of the matches in `pool`, best first.
     pub fn propose(&mut self, context: &Context, pool: &[u32], step: &Step, out: &mut Vec<Candidate>) {
@@ -94,12 +137,23 @@ impl Sampler {
         self.target.clear();
         self.target.extend(pool.iter().map(|&i| context.matches.target[i as usize]));
         self.triangles.clear();
-        self.graph.load(context, pool, step.sigma);
-        let graphs = scale_steps(context.scale_range);
-        for k in 0..graphs {
-            self.graph.build(scale_step(context.scale_range, k, graphs), step.sigma);
-            self.rank_edges((EDGES_MAX / graphs).max(EDGES_MIN), (EDGES_EXPANDED / graphs).max(EDGES_EXPANDED_MIN));
-            self.expand_edges();
+        self.cloud.load(context, pool, step.sigma);
+        self.tally.load(context, pool.len(), self.cloud.unit);
+        let tolerance = LENGTH_GATE * core::f64::consts::SQRT_2 * step.sigma;
+        if context.with_scale {
+            let per_scale = tolerance * context.sigma_max / step.sigma;
+            let vote = Vote { range: step.scales, tolerance, tolerance_per_scale: per_scale };
+            self.scales.measure(self.arch, &self.cloud, &vote);
+            let bins = self.scales.bins();
+            for bin in 0..bins {
+                self.scales.build(self.arch, bin, self.cloud.count, &mut self.graph);
+                self.find_triangles((EDGES_EXPANDED / bins).max(EDGES_EXPANDED_MIN));
+            }
+        } else {
+            let ratio = self.cloud.source_unit / self.cloud.unit;
+            let tolerance = tolerance / self.cloud.unit;
+            self.graph.build_rigid(self.arch, &self.cloud, ratio as f32, tolerance as f32);
+            self.find_triangles(EDGES_EXPANDED);
         }
         self.triangles.sort_unstable();
         self.triangles.dedup();
@@ -107,30 +161,63 @@ impl Sampler {
         if out.is_empty() {
             self.try_triangles(context, step, false, out);
         }
-        out.sort_by(|a, b| b.score.total_cmp(&a.score));
+        out.sort_by(|a, b| b.worth.score.total_cmp(&a.worth.score));
     }
 
-    /// The edges with the most common neighbours.
-    fn rank_edges(&mut self, edges_max: usize, expanded: usize) {
+    /// Adds the triangles of the graph's `expanded` best edges.
+    fn find_triangles(&mut self, expanded: usize) {
+        let arch = self.arch;
+        wide(
+            arch,
+            #[inline(always)]
+            || {
+                self.keep_edges();
+                self.rank_edges(expanded);
+                self.expand_edges();
+            },
+        );
+    }
+
+    /// Keeps the edges whose ends have more common neighbours than chance gives.
+    #[inline(always)]
+    fn keep_edges(&mut self) {
         let graph = &self.graph;
-        let degree_sum: usize = graph.rows.iter().map(|w| w.count_ones() as usize).sum();
-        let stride = (degree_sum / 2).div_ceil(edges_max.max(1)).max(1);
+        self.degrees.clear();
+        for i in 0..graph.count {
+            self.degrees.push(common(graph.row(i), graph.row(i)));
+        }
+        let edges = self.degrees.iter().map(|&d| d as usize).sum::<usize>() / 2;
+        let stride = edges.div_ceil(EDGES_MAX).max(1);
+        self.kept.clear(graph.count);
         self.edges.clear();
+        let inverse = 1.0 / graph.count.max(1) as f32;
         let mut skip = 0;
         for i in 0..graph.count {
-            let row = graph.row(i);
-            for j in ones(row, i + 1) {
-                skip += 1;
-                if skip < stride {
-                    continue;
-                }
-                skip = 0;
-                let common = row.iter().zip(graph.row(j)).map(|(a, b)| (a & b).count_ones()).sum();
-                if common > 0 {
-                    self.edges.push(Edge { common: Reverse(common), i: i as u32, j: j as u32 });
+            let (row, share) = (graph.row(i), self.degrees[i] as f32 * inverse);
+            let neighbours = positions(row, Some(i), &mut self.neighbours);
+            while skip < neighbours {
+                let j = self.neighbours[skip] as usize;
+                skip += stride;
+                let count = common(row, graph.row(j));
+                let expected = share * self.degrees[j] as f32;
+                let excess = count as f32 - expected;
+                let clique = 2 * count > self.degrees[i].min(self.degrees[j]);
+                if (excess * excess.abs() > EXCESS_MIN * EXCESS_MIN * (expected + 0.25)) | clique {
+                    self.kept.connect(i, j);
+                    self.edges.push(Edge { kept: Reverse(0), common: Reverse(count), i: i as u32, j: j as u32 });
                 }
             }
+            skip -= neighbours;
         }
+    }
+
+    /// The kept edges whose ends have the most common neighbours among kept edges.
+    #[inline(always)]
+    fn rank_edges(&mut self, expanded: usize) {
+        for edge in &mut self.edges {
+            edge.kept = Reverse(common(self.kept.row(edge.i as usize), self.kept.row(edge.j as usize)));
+        }
+        self.edges.retain(|e| e.kept.0 > 0);
         if self.edges.len() > expanded {
             self.edges.select_nth_unstable(expanded);
             self.edges.truncate(expanded);
@@ -138,19 +225,28 @@ impl Sampler {
     }
 
     /// Adds the best triangles of each ranked edge.
+    #[inline(always)]
     fn expand_edges(&mut self) {
         let graph = &self.graph;
-        let expected = graph.count as f64 * graph.density().powi(3);
+        let inverse = 1.0 / (graph.count as f64 * graph.count as f64);
         for edge in &self.edges {
             let (i, j) = (edge.i as usize, edge.j as usize);
             self.common.clear();
             self.common.extend(graph.row(i).iter().zip(graph.row(j)).map(|(a, b)| a & b));
             let first = self.triangles.len();
-            for k in ones(&self.common, 0) {
-                let common: u32 = self.common.iter().zip(graph.row(k)).map(|(a, b)| (a & b).count_ones()).sum();
+            let expected = f64::from(self.degrees[i]) * f64::from(self.degrees[j]) * inverse;
+            self.shared.clear();
+            self.shared.extend_from_slice(self.kept.row(i));
+            for (shared, word) in self.shared.iter_mut().zip(self.kept.row(j)) {
+                *shared &= word;
+            }
+            let thirds = positions(&self.shared, None, &mut self.neighbours);
+            for k in (0..thirds).step_by(thirds.div_ceil(THIRDS_MAX).max(1)) {
+                let k = self.neighbours[k] as usize;
+                let common = common(&self.common, graph.row(k));
                 let mut vertices = [edge.i, edge.j, k as u32];
                 vertices.sort_unstable();
-                let surprise = Reverse(surprise(common, expected));
+                let surprise = Reverse(surprise(common, expected * f64::from(self.degrees[k])));
                 let triangle = Triangle { surprise, common: Reverse(common), vertices };
                 if self.triangles.len() - first < TRIANGLES_PER_EDGE {
                     self.triangles.push(triangle);
@@ -166,13 +262,13 @@ impl Sampler {
     /// Turns triangles, most supported first, into distinct candidates.
     fn try_triangles(&mut self, context: &Context, step: &Step, fat: bool, out: &mut Vec<Candidate>) {
         self.explained.clear();
-        let (mut tried, mut best_raw, mut best) = (0, 0.0_f64, 0.0_f64);
+        let (mut tried, mut best_raw, mut best) = (0, f64::NEG_INFINITY, Worth::default());
         for t in 0..self.triangles.len() {
             let triangle = self.triangles[t];
             if tried >= step.hypotheses_max {
                 break;
             }
-            if f64::from(triangle.common.0) < COMMON_SHARE * best - 3.0 {
+            if f64::from(triangle.common.0) < COMMON_SHARE * f64::from(best.count) - 3.0 {
                 continue;
             }
             let v = triangle.vertices.map(|k| k as usize);
@@ -181,17 +277,24 @@ impl Sampler {
             }
             let Some(motion) = self.minimal(context, step, v, fat) else { continue };
             tried += 1;
-            let score = self.graph.score(&motion, step.sigma);
-            best_raw = best_raw.max(score);
-            if score < RAW_SHARE * best_raw {
+            let worth = self.cloud.worth(self.arch, context, &motion, &mut self.tally);
+            best_raw = best_raw.max(worth.score);
+            if worth.score < best_raw - RAW_MARGIN {
                 continue;
             }
-            let (motion, score) = self.improve(context, step, motion, score);
-            let full = out.len() == CANDIDATES_MAX;
-            if !full || out.iter().any(|c| c.score < score) {
-                best = best.max(score);
-                self.keep(Candidate { motion, score }, step.sigma, out);
+            let candidate = self.improve(context, Candidate { motion, worth }, &[1.0]);
+            if !kept_by(out, &candidate, RAW_MARGIN) {
+                continue;
             }
+            // A few true matches that chance ones have tilted are led out of that trap by a wider view.
+            let candidate = self.improve(context, candidate, &[1.0, 2.0]);
+            if !kept_by(out, &candidate, 0.0) {
+                continue;
+            }
+            if candidate.worth.score > best.score {
+                best = candidate.worth;
+            }
+            self.keep(candidate, out);
         }
     }
 
@@ -213,59 +316,55 @@ impl Sampler {
         (fits && (low..=high).contains(&motion.scale)).then_some(motion)
     }
 
-    /// Two reweighted solves over the pool; kept while the score grows.
-    fn improve(&mut self, context: &Context, step: &Step, motion: Motion, score: f64) -> (Motion, f64) {
-        let mut best = (motion, score);
-        for _ in 0..2 {
-            self.graph.weights(&best.0, step.sigma, &mut self.weights);
-            let Some(motion) = solve::weighted(&self.source, &self.target, &self.weights, context.with_scale) else {
-                break;
-            };
-            if !(context.scale_range.0..=context.scale_range.1).contains(&motion.scale) {
-                break;
-            }
-            let score = self.graph.score(&motion, step.sigma);
-            if score <= best.1 {
-                break;
-            }
-            best = (motion, score);
+    /// Reweighted solves over the pool while the worth grows, at the first of these multiples of the consensus' radius at
+    /// which it does.
+    fn improve(&mut self, context: &Context, start: Candidate, multiples: &[f64]) -> Candidate {
+        let mut best = start;
+        for _ in 0..IMPROVEMENTS {
+            let near = best.worth.radius / RADIUS;
+            let Some(better) = multiples.iter().find_map(|m| self.resolve(context, &best, m * near)) else { break };
+            best = better;
         }
         best
     }
 
+    /// A solve with weights e^{−r²/2σ²}, if that is worth more.
+    fn resolve(&mut self, context: &Context, from: &Candidate, sigma: f64) -> Option<Candidate> {
+        self.cloud.weights(self.arch, &from.motion, sigma, &mut self.weights);
+        let motion = solve::weighted(&self.source, &self.target, &self.weights, context.with_scale)?;
+        if !(context.scale_range.0..=context.scale_range.1).contains(&motion.scale) {
+            return None;
+        }
+        let worth = self.cloud.worth(self.arch, context, &motion, &mut self.tally);
+        (worth.score > from.worth.score).then_some(Candidate { motion, worth })
+    }
+
     /// Keeps a candidate, in place of the worst if full, and what it explains.
-    fn keep(&mut self, candidate: Candidate, sigma: f64, out: &mut Vec<Candidate>) {
+    fn keep(&mut self, candidate: Candidate, out: &mut Vec<Candidate>) {
         let slot = if out.len() < CANDIDATES_MAX {
             out.push(candidate);
             self.explained.push(Vec::new());
             out.len() - 1
         } else {
-            let worst = (1..out.len()).fold(0, |w, k| if out[k].score < out[w].score { k } else { w });
+            let worst = (1..out.len()).fold(0, |w, k| if out[k].worth.score < out[w].worth.score { k } else { w });
             out[worst] = candidate;
             worst
         };
-        let set = &mut self.explained[slot];
-        set.clear();
-        set.resize(self.graph.words, 0);
-        self.graph.for_each_near(&candidate.motion, sigma, 4.5, |k, _| set[k / 64] |= 1 << (k % 64));
+        let reach = EXPLAINED * candidate.worth.radius;
+        self.cloud.near(self.arch, &candidate.motion, reach, &mut self.explained[slot]);
     }
 }
 
-/// −1000 ln of the Poisson tail's leading term: how unlikely so many common neighbours are where `expected` are.
+/// Whether a candidate is among the best, or would be with a score better by `margin`.
+fn kept_by(out: &[Candidate], candidate: &Candidate, margin: f64) -> bool {
+    out.len() < CANDIDATES_MAX || out.iter().any(|c| c.worth.score < candidate.worth.score + margin)
+}
+
+/// How unlikely so many common neighbours are where `expected` are: of two Poisson counts 1000 times the squared difference
+/// after the square root has made their variances equal (a quarter), which is near enough −1000 ln of the tail.
 fn surprise(common: u32, expected: f64) -> u32 {
-    let (count, expected) = (f64::from(common), expected.max(0.05));
-    if count > expected { (1000.0 * (count * libm::log(count / expected) - count + expected)) as u32 } else { 0 }
-}
-
-/// Graphs needed to cover a range of scales.
-fn scale_steps((low, high): (f64, f64)) -> usize {
-    (libm::log(high / low) / libm::log(SCALE_STEP)).ceil().max(1.0) as usize
-}
-
-/// The k-th of `count` equal steps of a range of scales.
-fn scale_step((low, high): (f64, f64), k: usize, count: usize) -> (f64, f64) {
-    let at = |k: usize| low * libm::pow(high / low, k as f64 / count as f64);
-    (at(k), at(k + 1))
+    let excess = f64::from(common).sqrt() - expected.max(0.05).sqrt();
+    if excess > 0.0 { (4000.0 * excess * excess) as u32 } else { 0 }
 }
 
 /// Height of a triangle over its longest edge.
@@ -273,155 +372,4 @@ fn height(q: [&Vector3<f64>; 3]) -> f64 {
     let area2 = (q[1] - q[0]).cross(&(q[2] - q[0])).norm();
     let longest = (q[1] - q[0]).norm().max((q[2] - q[0]).norm()).max((q[2] - q[1]).norm());
     if longest > 0.0 { area2 / longest } else { 0.0 }
-}
-
-/// Positions of set bits from `from` on.
-fn ones(words: &[u64], from: usize) -> impl Iterator<Item = usize> {
-    let first = from / 64;
-    words.iter().enumerate().skip(first).flat_map(move |(w, &bits)| {
-        let mut bits = if w == first { bits & (u64::MAX << (from % 64)) } else { bits };
-        core::iter::from_fn(move || {
-            let k = bits.trailing_zeros() as usize;
-            bits &= bits.wrapping_sub(1);
-            (k < 64).then_some(w * 64 + k)
-        })
-    })
-}
-
-/// The pool's points in single precision, by axis, and which pairs of matches agree in length.
-#[derive(Debug, Default)]
-struct Graph {
-    count: usize,
-    /// Words a row.
-    words: usize,
-    rows: Vec<u64>,
-    /// Unit of the coordinates below: they are near 1, so that f32 neither overflows nor loses the tolerance.
-    unit: f64,
-    source_unit: f64,
-    /// Padded with NaN to whole words: NaN agrees with nothing.
-    source: [Vec<f32>; 3],
-    target: [Vec<f32>; 3],
-}
-
-impl Graph {
-    fn row(&self, i: usize) -> &[u64] {
-        &self.rows[i * self.words..(i + 1) * self.words]
-    }
-
-    /// Share of pairs that are connected.
-    fn density(&self) -> f64 {
-        let n = self.count as f64;
-        let ends: usize = self.rows.iter().map(|w| w.count_ones() as usize).sum();
-        ends as f64 / (n * (n - 1.0)).max(1.0)
-    }
-
-    fn load(&mut self, context: &Context, pool: &[u32], sigma: f64) {
-        let matches: &Matches = context.matches;
-        self.count = pool.len();
-        self.words = pool.len().div_ceil(64);
-        self.unit = matches.target_extent.iter().fold(sigma, |m, &l| m.max(l));
-        self.source_unit = self.unit / (context.scale_range.0 * context.scale_range.1).sqrt();
-        let fill = |column: &mut Vec<f32>, points: &[Vector3<f64>], axis: usize, factor: f64| {
-            column.clear();
-            column.extend(pool.iter().map(|&i| (points[i as usize][axis] * factor) as f32));
-            column.resize(pool.len().div_ceil(64) * 64, f32::NAN);
-        };
-        for axis in 0..3 {
-            fill(&mut self.source[axis], &matches.source, axis, 1.0 / self.source_unit);
-            fill(&mut self.target[axis], &matches.target, axis, 1.0 / self.unit);
-        }
-    }
-
-    /// Connects the pairs whose lengths agree at some scale in `scale`.
-    fn build(&mut self, scale: (f64, f64), sigma: f64) {
-        let tolerance = (LENGTH_GATE * core::f64::consts::SQRT_2 * sigma / self.unit) as f32;
-        let ratio = self.source_unit / self.unit;
-        let (low, high) = ((scale.0 * ratio) as f32, (scale.1 * ratio) as f32);
-        self.rows.clear();
-        self.rows.resize(self.count * self.words, 0);
-        for i in 0..self.count {
-            for w in i / 64..self.words {
-                let bits = self.compatible(i, w * 64, low, high, tolerance);
-                let bits = if w == i / 64 { bits & (u64::MAX << (i % 64)) & !(1 << (i % 64)) } else { bits };
-                self.rows[i * self.words + w] |= bits;
-                let mut rest = bits;
-                while rest != 0 {
-                    let j = w * 64 + rest.trailing_zeros() as usize;
-                    self.rows[j * self.words + i / 64] |= 1 << (i % 64);
-                    rest &= rest - 1;
-                }
-            }
-        }
-    }
-
-    /// Bit k: whether match `i` and match `start + k` agree: `low·d − τ ≤ e ≤ high·d + τ` for source length d and target
-    /// length e, both at least τ (in target units).
-    fn compatible(&self, i: usize, start: usize, low: f32, high: f32, tolerance: f32) -> u64 {
-        let (s, t) = (block(&self.source, start), block(&self.target, start));
-        let p = [self.source[0][i], self.source[1][i], self.source[2][i]];
-        let q = [self.target[0][i], self.target[1][i], self.target[2][i]];
-        let mut flags = [0_u8; 64];
-        for k in 0..64 {
-            let (a, b, c) = (s[0][k] - p[0], s[1][k] - p[1], s[2][k] - p[2]);
-            let d = (a * a + b * b + c * c).sqrt();
-            let (a, b, c) = (t[0][k] - q[0], t[1][k] - q[1], t[2][k] - q[2]);
-            let e = (a * a + b * b + c * c).sqrt();
-            let long = (high * d >= tolerance) & (e >= tolerance);
-            flags[k] = u8::from((low * d - tolerance <= e) & (e <= high * d + tolerance) & long);
-        }
-        // Eight 0/1 bytes to eight bits at a time.
-        let mut bits = 0;
-        for (k, bytes) in flags.chunks_exact(8).enumerate() {
-            let word = bytes.iter().rev().fold(0_u64, |w, &b| w << 8 | u64::from(b));
-            bits |= (word.wrapping_mul(0x0102_0408_1020_4080) >> 56) << (8 * k);
-        }
-        bits
-    }
-
-    /// MAGSAC++ gain of the pool at this σ: 1 for a perfect match, 0 beyond the 99 % quantile.
-    fn score(&self, motion: &Motion, sigma: f64) -> f64 {
-        let edge = exp(-EXPONENT_GATE);
-        let full = 1.0 - edge - edge * EXPONENT_GATE;
-        let mut score = 0.0;
-        self.for_each_near(motion, sigma, EXPONENT_GATE, |_, x| score += full - (1.0 - exp(-x) - edge * x));
-        score
-    }
-
-    /// e^{−x} where it counts, x = r²/2σ².
-    fn weights(&self, motion: &Motion, sigma: f64, out: &mut Vec<f64>) {
-        out.clear();
-        out.resize(self.count, 0.0);
-        self.for_each_near(motion, sigma, EXPONENT_GATE, |k, x| out[k] = exp(-x));
-    }
-
-    /// Calls `f(k, x)` for each match with x = r²/2σ² below `gate`, in order; r in units of the residual unit.
-    fn for_each_near(&self, motion: &Motion, sigma: f64, gate: f64, mut f: impl FnMut(usize, f64)) {
-        let m = motion.rotation * (motion.scale * self.source_unit / self.unit);
-        let m: [f32; 9] = core::array::from_fn(|k| m[(k / 3, k % 3)] as f32);
-        let t: [f32; 3] = core::array::from_fn(|k| (motion.translation[k] / self.unit) as f32);
-        let sigma = sigma * motion.residual_unit() / self.unit;
-        let inverse = 0.5 / (sigma * sigma);
-        let limit = (gate / inverse) as f32;
-        for w in 0..self.words {
-            let (p, q) = (block(&self.source, w * 64), block(&self.target, w * 64));
-            let mut squared = [0.0_f32; 64];
-            for k in 0..64 {
-                let a = q[0][k] - (m[0] * p[0][k] + m[1] * p[1][k] + m[2] * p[2][k] + t[0]);
-                let b = q[1][k] - (m[3] * p[0][k] + m[4] * p[1][k] + m[5] * p[2][k] + t[1]);
-                let c = q[2][k] - (m[6] * p[0][k] + m[7] * p[1][k] + m[8] * p[2][k] + t[2]);
-                squared[k] = a * a + b * b + c * c;
-            }
-            for (k, &r2) in squared.iter().enumerate() {
-                if r2 < limit {
-                    f(w * 64 + k, f64::from(r2) * inverse);
-                }
-            }
-        }
-    }
-}
-
-/// 64 points from `start` on, by axis.
-fn block(columns: &[Vec<f32>; 3], start: usize) -> [&[f32; 64]; 3] {
-    const EMPTY: [f32; 64] = [f32::NAN; 64];
-    columns.each_ref().map(|column| column[start..].first_chunk().unwrap_or(&EMPTY))
 }

@@ -6,6 +6,7 @@
 //! E₁(0) is infinite, so a residual is never scored against itself (leave-one-out) and arguments are at least
 //! [`ARGUMENT_MIN`]. σ_max is a largest standard deviation, not a gate.
 
+use super::density::{Shape, Tree};
 use libm::{exp, log};
 use std::sync::OnceLock;
 
@@ -102,17 +103,19 @@ impl Kernel {
     }
 }
 
-/// S(30) of residual norms: leave-one-out, and reflected at 0, since norms end there.
+/// S(30) of residual norms: leave-one-out, and reflected at 0, since norms end there. O(log n) a value.
 #[derive(Clone, Debug, Default)]
 pub struct NormDensity {
     samples: Vec<f64>,
+    tree: Tree,
 }
 
 impl NormDensity {
-    /// Replaces the samples (norms, ≥ 0) without allocating anew.
+    /// Replaces the samples (norms, finite and ≥ 0) without allocating anew.
     pub fn set(&mut self, samples: impl Iterator<Item = f64>) {
         self.samples.clear();
         self.samples.extend(samples);
+        self.tree.set(&self.samples);
     }
 
     /// Number of samples.
@@ -148,7 +151,10 @@ impl NormDensity {
     }
 
     fn sum(&self, r: f64, kernel: &Kernel) -> f64 {
-        self.samples.iter().map(|&s| pair(kernel, r, s)).sum()
+        let root = |x: f64| (x / kernel.precision).sqrt();
+        let shape = Shape { bandwidth: root(0.5), kink: root(ARGUMENT_MIN), reach: root(ARGUMENT_MAX) };
+        let one = |t: f64| self.tree.sum(t, &shape, |d| e1_fast(kernel.argument(d)));
+        one(r) + one(-r)
     }
 }
 
@@ -290,5 +296,41 @@ mod tests {
         assert!((density.at(0.6, 0.8) / both(0.6, &samples) - 1.0).abs() < 1e-6);
         density.set([0.4].into_iter());
         assert_eq!((density.at_sample(0, 1.0), density.at(0.4, 1.0), density.len()), (0.0, 0.0, 1));
+    }
+
+    #[test]
+    fn any_number_of_residuals_is_summed_as_if_directly() {
+        // Chi-distributed, crowded, and partly equal residuals; bandwidths from narrow to wide.
+        for n in [2, 17, 100, 512, 513, 3000] {
+            let samples: Vec<f64> = (0..n)
+                .map(|k| {
+                    let u = (f64::from(k) + 0.5) / f64::from(n);
+                    match k % 4 {
+                        0 => 0.02 * u * u,
+                        1 => 0.01 + 1e-5 * u,
+                        2 => 0.015,
+                        _ => 0.08 * (1.0 - u),
+                    }
+                })
+                .collect();
+            let mut density = NormDensity::default();
+            density.set(samples.iter().copied());
+            for sigma in [1e-4, 0.01, 0.5] {
+                let kernel = Kernel::new(samples.len(), sigma);
+                let terms = |r: f64, s: f64| e1(kernel.argument(r - s)) + e1(kernel.argument(r + s));
+                for i in (0..samples.len()).step_by(1 + samples.len() / 23) {
+                    let r = samples[i];
+                    let others = (0..samples.len()).filter(|&j| j != i).map(|j| terms(r, samples[j])).sum::<f64>();
+                    let direct = kernel.amplitude * others / (samples.len() - 1) as f64;
+                    let tree = density.at_sample(i, sigma);
+                    let scale = direct.max(kernel.amplitude / samples.len() as f64);
+                    assert!((tree - direct).abs() < 1e-6 * scale, "n = {n}, σ = {sigma}: {tree:e} {direct:e}");
+                    let r = r * 1.01 + 1e-4;
+                    let direct = samples.iter().map(|&s| terms(r, s)).sum::<f64>() * kernel.amplitude / f64::from(n);
+                    let scale = direct.max(kernel.amplitude / f64::from(n));
+                    assert!((density.at(r, sigma) - direct).abs() < 1e-6 * scale, "n = {n}, σ = {sigma}");
+                }
+            }
+        }
     }
 }

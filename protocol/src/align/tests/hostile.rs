@@ -168,4 +168,55 @@ proptest! {
             prop_assert!(sim.translation.iter().all(|x| x.is_finite()) && sim.scale > 0.0);
         }
     }
+
+    #[test]
+    fn degenerate_shapes_of_any_size_are_answered(
+        shape in 0_usize..5,
+        n in 0_usize..200,
+        size in prop::sample::select(vec![1e-9, 1e-3, 1.0, 1e6, 1e9]),
+        sigma_max in prop::sample::select(vec![1e-9, 0.03, 1e3]),
+        true_share in prop::sample::select(vec![0.0, 0.2, 1.0]),
+        model in prop::sample::select(vec![
+            Model::Rigid,
+            Model::Similarity { scale_min: 0.4, scale_max: 2.5 },
+            Model::Similarity { scale_min: 1e-6, scale_max: 1e6 },
+        ]),
+        seed in any::<u64>(),
+    ) {
+        let mut draw = Draw::new(seed);
+        // A line, a plane, one cluster, four points of a line many times, anywhere.
+        let mut place = || match shape {
+            0 => Vector3::new(0.6, 0.0, 0.8) * draw.unit(),
+            1 => Vector3::new(draw.unit(), draw.unit(), 0.5),
+            2 => Vector3::repeat(0.5) + draw.noise(1e-6),
+            3 => Vector3::repeat((draw.unit() * 4.0).floor() / 4.0),
+            _ => draw.in_cube(),
+        };
+        let source: Vec<[f64; 3]> = (0..n).map(|_| (place() * size).into()).collect();
+        let target: Vec<[f64; 3]> = (0..n)
+            .map(|i| if (i as f64) < true_share * n as f64 { source[i] } else { (place() * size).into() })
+            .collect();
+        let config = SolverConfig { model, support_min: 4.0, ..config(sigma_max) };
+        let answer = align(&Problem { source: &source, target: &target, scores: None }, &config).expect("well-formed");
+        if let Ok(found) = answer {
+            prop_assert!(found.sigma.is_finite() && found.log10_nfa <= config.log10_nfa_max);
+            prop_assert!(found.information_eigenvalues.iter().all(|x| x.is_finite() && *x > 0.0));
+            prop_assert!(shape != 0 && shape != 3, "a line leaves a rotation open: {:?}", found);
+        }
+    }
+
+    #[test]
+    fn malformed_numbers_are_named(
+        n in 1_usize..30,
+        at in any::<prop::sample::Index>(),
+        axis in 0_usize..3,
+        side in any::<bool>(),
+        bad in prop::sample::select(vec![f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1.1e9, -1.1e9]),
+    ) {
+        let mut case = Case::uniform(7, n, n, 1.0);
+        let index = at.index(n);
+        if side { case.source[index][axis] = bad } else { case.target[index][axis] = bad }
+        let problem = Problem { source: &case.source, target: &case.target, scores: None };
+        prop_assert_eq!(align(&problem, &config(0.1)), Err(AlignError::NotFinite { index }));
+    }
 }
