@@ -15,8 +15,8 @@ mod gls;
 mod pairs;
 #[cfg(test)]
 mod tests;
-#[cfg(test)]
-mod world;
+#[doc(hidden)]
+pub mod world;
 
 use super::trajectory::Trajectory;
 use crate::config::EstimateConfig;
