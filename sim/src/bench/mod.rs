@@ -1,6 +1,15 @@
 //! `merganser-sim bench`: how good and how fast the estimators are, as tables (MATH §4 and §5).
 
+pub mod corr;
+pub mod cpu;
 pub mod frames;
+pub mod outliers;
+pub mod peer;
+pub mod peers;
+pub mod registration;
+pub mod row;
+pub mod solve;
+pub mod table;
 
 use crate::bar::progress_bar;
 use clap::Subcommand;
@@ -9,6 +18,12 @@ use std::io::Write;
 /// What to measure.
 #[derive(Debug, Subcommand)]
 pub enum Bench {
+    /// Correspondence-level consensus on a folder of .corr files: success, errors, honesty and time, beside peers
+    ///
+    /// A file holds matched points, most of them wrong, and the truth. Times are of the processor, per solve, so other
+    /// work on the machine counts little; ratios are the peer's time over ours. Exit code 1 if a wrong answer was
+    /// accepted, 2 if a file or option cannot be used.
+    Registration(registration::Registration),
     /// Frame-level consensus on seeded worlds: success, refusals and honesty of the covariance
     ///
     /// Two robots drive a figure-eight of about 120 m with drifting odometry; a cell has 20 alignments between them, of
@@ -26,18 +41,20 @@ pub enum Bench {
 /// Measures and prints. Returns whether the goals were reached.
 ///
 /// # Errors
-/// Standard output that cannot be written.
+/// Files that cannot be used, standard output that cannot be written.
 pub fn run(bench: Bench) -> anyhow::Result<bool> {
     match bench {
-        Bench::Frames { seeds, first } => {
-            let cells = frames::cells();
-            let bar = progress_bar(cells.len() as u64 * seeds, "worlds")?;
-            let measured: Vec<_> =
-                cells.iter().map(|cell| frames::measure(cell, first..first + seeds, || bar.inc(1))).collect();
-            bar.finish_and_clear();
-            let mut out = std::io::stdout().lock();
-            write!(out, "{}", frames::table(&cells, &measured))?;
-            Ok(cells.iter().zip(&measured).all(|(cell, tally)| cell.shortfall(tally).is_none()))
-        }
+        Bench::Registration(options) => registration::run(&options),
+        Bench::Frames { seeds, first } => frames(first, seeds),
     }
+}
+
+fn frames(first: u64, seeds: u64) -> anyhow::Result<bool> {
+    let cells = frames::cells();
+    let bar = progress_bar(cells.len() as u64 * seeds, "worlds")?;
+    let measure = |cell| frames::measure(cell, first..first + seeds, || bar.inc(1));
+    let measured: Vec<_> = cells.iter().map(measure).collect();
+    bar.finish_and_clear();
+    write!(std::io::stdout().lock(), "{}", frames::table(&cells, &measured))?;
+    Ok(cells.iter().zip(&measured).all(|(cell, tally)| cell.shortfall(tally).is_none()))
 }
