@@ -11,6 +11,8 @@ import struct
 import sys
 import time
 
+os.environ["OMP_NUM_THREADS"] = "1"  # Threads that wait for each other burn processor time.
+
 HEADER = "solver,group,N,ratio,seed,status,cpu_s,rot_deg,trans,scale_rel"
 
 
@@ -31,7 +33,7 @@ def kiss(prune):
 
     def solve(source, target, sigma):
         config = kiss_matcher.KISSMatcherConfig(voxel_size=0.05)
-        config.robin_noise_bound = 2 * 3 * sigma
+        config.robin_noise_bound = 3 * sigma
         config.solver_noise_bound = 3 * sigma
         matcher = kiss_matcher.KISSMatcher(config)
         if prune:
@@ -85,12 +87,12 @@ def main():
         except Exception as error:  # Broken installations fail in many ways.
             print(f"{name}: cannot be measured: {error}", file=sys.stderr)
     print(HEADER)
-    for path in files:
-        group, n, ratio, seed = os.path.basename(path).removesuffix(".corr").split("_")
-        if group == "SIM3":
-            continue  # None of these estimates scale.
-        source, target, sigma, rotation, translation = read(path)
-        for name, solve in ready.items():
+    for name, solve in ready.items():
+        for path in files:
+            group, n, ratio, seed = os.path.basename(path).removesuffix(".corr").split("_")
+            if group == "SIM3":
+                continue  # None of these estimates scale.
+            source, target, sigma, rotation, translation = read(path)
             began = time.process_time()
             found_rotation, found_translation = solve(source, target, sigma)
             spent = time.process_time() - began

@@ -16,6 +16,8 @@ const RIVAL_SHARE: f64 = 0.8;
 const BLEND_MARGIN_LOG10: f64 = 4.0;
 /// A member that only a wider gate admits must lower the NFA by this many powers of ten.
 const MEMBER_MARGIN_LOG10: f64 = 2.0;
+/// A member that lowers the NFA by less than this does not count against a rival.
+const STRAY_MARGIN_LOG10: f64 = 2.0;
 /// Too few or too weak to merge are shown below this: chance does as well in one case of ten.
 const SHOWN_LOG10_NFA_MAX: f64 = -1.0;
 
@@ -111,7 +113,7 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
         let of_second = second.set & !(first.set & !seconds);
         let nfa = |set| pairs.log10_nfa::<N>(set, self.search_volume()).0;
         // A member without which the first is as good does not outweigh the second.
-        let stray = |&l: &usize| nfa(of_first & !bit(l)) <= nfa(of_first);
+        let stray = |&l: &usize| nfa(of_first & !bit(l)) <= nfa(of_first) + STRAY_MARGIN_LOG10;
         let (all, rival) = (of_first.count_ones() as usize, of_second.count_ones() as usize);
         let earned = all - clique::vertices(of_first).filter(stray).count();
         let as_good = rival as f64 >= RIVAL_SHARE * earned as f64 && all as f64 >= RIVAL_SHARE * rival as f64;
