@@ -1,20 +1,15 @@
 //! One explanation of the alignments: a set that agrees, what it says of T_αβ, and how unlikely chance is to do as well.
 
+use super::FrameConsensus;
 use super::clique::{self, Set, bit};
 use super::gls::Gls;
 use super::measured::Measured;
 use super::pairs::Pairs;
 use super::predict::surprise;
-use super::{FrameConsensus, gate};
 use crate::geometry::{Covariance, Group};
 
 /// A member this improbable, given what the others predict, is none.
 const SURPRISE_MIN: f64 = 1e-3;
-/// Sets up to this size are searched for members that a gate on pairs left out; of more, a few do not matter.
-const GROWN_MAX: u32 = 24;
-/// Times a set may grow.
-const GROWTHS_MAX: u32 = 0;
-
 /// A settled set of alignments.
 pub(super) struct Hypothesis<const N: usize, G> {
     pub(super) set: Set,
@@ -27,7 +22,7 @@ pub(super) struct Hypothesis<const N: usize, G> {
 }
 
 impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
-    /// Estimates over `set`; drops, worst first, members that the others do not predict, and takes in those that they do.
+    /// Estimates over `set`; drops, worst first, members that the others do not predict.
     pub(super) fn settle(
         measured: &Measured<'_, N, G>,
         pairs: &Pairs,
@@ -35,22 +30,13 @@ impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
         scale: f64,
         largest: bool,
     ) -> Option<Self> {
-        let (mut dropped, mut growths) = (0, 0);
         loop {
             let (log10_nfa, hub) = pairs.log10_nfa::<N>(set, measured.search_volume());
             let gls = Gls::solve(measured, set, hub)?;
-            let unpredicted = unpredicted(measured, set, &gls);
-            if unpredicted != 0 {
-                set &= !unpredicted;
-                dropped |= unpredicted;
-                continue;
+            match unpredicted(measured, set, &gls) {
+                0 => return Some(Self { set, scale, log10_nfa, largest, gls }),
+                some => set &= !some,
             }
-            let more = if growths < GROWTHS_MAX { joiners(measured, pairs, set, hub) & !dropped } else { 0 };
-            if more == 0 {
-                return Some(Self { set, scale, log10_nfa, largest, gls });
-            }
-            growths += 1;
-            set |= more;
         }
     }
 
@@ -63,7 +49,7 @@ impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
     pub(super) fn consensus(&self, measured: &Measured<'_, N, G>) -> FrameConsensus<(G, Covariance<N>)> {
         let scale_max = measured.config.covariance_scale_max.max(1.0);
         let freedom = N as f64 * f64::from(self.set.count_ones() - 1).max(1.0);
-        // A χ² that chance exceeds once in twenty times says nothing against the stated covariances.
+        // A χ² that chance exceeds once in fifty times says nothing against the stated covariances.
         let excess = self.gls.chi_squared / freedom;
         let significant = excess > 1.0 + 2.33 * (2.0 / freedom).sqrt();
         let scale_squared = if significant { excess.clamp(1.0, scale_max * scale_max) } else { 1.0 };
@@ -93,22 +79,4 @@ fn unpredicted<const N: usize, G: Group<N>>(measured: &Measured<'_, N, G>, set: 
     let members = gls.left_out.len();
     let dropped = (members / 16).max(1).min(members.saturating_sub(2));
     outside.iter().take(dropped).map(|&(_, l)| bit(l)).sum()
-}
-
-/// Alignments outside `set` that it predicts: a gate on pairs leaves out a true one now and then.
-fn joiners<const N: usize, G: Group<N>>(measured: &Measured<'_, N, G>, pairs: &Pairs, set: Set, hub: usize) -> Set {
-    let members = set.count_ones();
-    if !(2..=GROWN_MAX).contains(&members) {
-        return 0;
-    }
-    let scales = measured.scales();
-    let widest = gate(N, scales[scales.len() - 1]);
-    let agreeing = |l: usize| clique::vertices(set).filter(|&m| pairs.agree(m, l, widest)).count() as u32;
-    let joins = |l: usize| {
-        let Some(gls) = Gls::solve(measured, set | bit(l), hub) else { return false };
-        let place = (set & (bit(l) - 1)).count_ones() as usize;
-        gls.left_out.get(place).is_some_and(|&d2| surprise::<N>(d2, gls.others(d2), &scales) >= SURPRISE_MIN)
-    };
-    let outsiders = (0..measured.alignments.len()).filter(|&l| set & bit(l) == 0);
-    outsiders.filter(|&l| 2 * agreeing(l) > members && joins(l)).map(bit).sum()
 }
