@@ -32,13 +32,13 @@ pub struct Registration {
     /// Weights that refine the answer; several make a table each
     #[arg(long, value_delimiter = ',', default_value = "auto")]
     pub weighting: Vec<Refinement>,
-    /// Recorded results of peers [default: peers.csv beside DIR]
+    /// Recorded results of peers; without it, peers.csv beside DIR
     #[arg(long, value_name = "FILE")]
     pub peers: Option<PathBuf>,
     /// Measure peers on the same files, in this Python interpreter
     #[arg(long, value_name = "PYTHON", requires = "inputs")]
     pub peer_python: Option<PathBuf>,
-    /// Which peers [default: all that are installed]: kiss_prune_solve, kiss_solve, o3d_ransac, o3d_fgr
+    /// Which peers, of kiss_prune_solve, kiss_solve, o3d_ransac, o3d_fgr; without it, all that are installed
     #[arg(long, value_delimiter = ',', requires = "peer_python")]
     pub peer: Vec<String>,
     /// Solve also this many problems without a true match, which nothing should be accepted in
