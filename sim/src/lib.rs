@@ -4,6 +4,8 @@
 //! A run is a pure function of a [`scenario::Scenario`] and a seed: the same pair gives the same trace hash, bit for bit.
 //! First a storm (robots drive, faults rage), then calm: the network heals and the swarm must converge in a stated time.
 
+pub mod bar;
+pub mod bench;
 pub mod check;
 pub mod core;
 pub mod dice;

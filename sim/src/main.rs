@@ -1,17 +1,18 @@
-//! `merganser-sim`: runs scenarios and writes the demo's recordings.
+//! `merganser-sim`: runs scenarios, writes the demo's recordings, measures the estimators.
 //!
-//! Exit codes: 0 all invariants held, 1 one broke, 2 the command or the scenario cannot be used.
+//! Exit codes: 0 all invariants held and goals were reached, 1 not so, 2 the command or a file cannot be used.
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use merganser_protocol::agent::Agent;
+use merganser_sim::bar::progress_bar;
+use merganser_sim::bench::{self, Bench};
 use merganser_sim::record::record;
 use merganser_sim::report::Report;
 use merganser_sim::scenario::Scenario;
 use merganser_sim::svg::picture;
 use merganser_sim::swarm::{Outcome, Swarm};
-use std::io::{IsTerminal, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -58,6 +59,9 @@ enum Command {
         #[arg(long)]
         scenario: Option<PathBuf>,
     },
+    /// Measure the estimators: success, honesty and time
+    #[command(subcommand)]
+    Bench(Bench),
 }
 
 /// Seeds from the first up to, but without, the second.
@@ -84,6 +88,7 @@ fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> anyhow::Result<bool> {
     match command {
+        Command::Bench(what) => bench::run(what),
         Command::Record { out, seed, scenario } => {
             let scenario = match scenario {
                 Some(path) => load(&path)?,
@@ -157,17 +162,10 @@ fn run(
 
 fn simulate(scenario: &Scenario, seed: u64) -> anyhow::Result<Outcome<Agent>> {
     let swarm = Swarm::<Agent>::new(scenario.clone(), seed)?;
-    let bar = progress_bar(swarm.end().as_secs_f64())?;
+    let bar = progress_bar(swarm.end().as_secs_f64() as u64, "virtual s")?;
     let outcome = swarm.run(|now| bar.set_position(now.as_secs_f64() as u64));
     bar.finish_and_clear();
     Ok(outcome?)
-}
-
-fn progress_bar(secs: f64) -> anyhow::Result<ProgressBar> {
-    let hidden = !std::io::stderr().is_terminal();
-    let target = if hidden { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() };
-    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} virtual s, {elapsed}")?;
-    Ok(ProgressBar::with_draw_target(Some(secs as u64), target).with_style(style))
 }
 
 fn write(folder: &Path, report: &Report, outcome: &Outcome<Agent>) -> anyhow::Result<()> {

@@ -3,7 +3,7 @@
 //! independent marginals gives 31.
 
 use super::clique::{self, Set};
-use super::{Alignment, Measured};
+use super::measured::{Alignment, Measured};
 use crate::estimate::residual::Residual;
 use crate::geometry::Group;
 use nalgebra::{DMatrix, Dyn, SMatrix, SVector, linalg::Cholesky};
@@ -26,6 +26,12 @@ pub(super) struct Gls<const N: usize, G> {
 }
 
 impl<const N: usize, G: Group<N>> Gls<N, G> {
+    /// χ² without a member that lies `distance_squared` from what the others predict, and its degrees of freedom.
+    pub(super) fn others(&self, distance_squared: f64) -> (f64, f64) {
+        let freedom = N * self.left_out.len().saturating_sub(2);
+        ((self.chi_squared - distance_squared).max(0.0), freedom as f64)
+    }
+
     /// Solves over `set`, starting from member `hub`'s hypothesis. `None` where the covariance is numerically singular
     /// or the iteration runs away.
     pub(super) fn solve(measured: &Measured<'_, N, G>, set: Set, hub: usize) -> Option<Self> {

@@ -5,7 +5,7 @@
 //! [`super::super::residual`] with A, T_m, B for T_i, T_αβ, T_j, and its four errors are independent.
 
 use super::clique::{self, Set, bit};
-use super::{Alignment, Candidate, Measured, gate};
+use super::measured::{Alignment, Measured};
 use crate::estimate::residual::Residual;
 use crate::estimate::trajectory::Trajectory;
 use crate::geometry::{Group, Se3};
@@ -47,11 +47,10 @@ impl Pairs {
         self.distance_squared[m * self.n + l] < gate && self.distance_squared[l * self.n + m] < gate
     }
 
-    /// Whether two disjoint sets deny each other: fewer than half of the pairs across agree at the wider of their gates.
-    /// Two halves of one truth, parted by a pair just outside the gate, do not.
-    pub(super) fn contradict<const N: usize>(&self, a: &Candidate, b: &Candidate) -> bool {
-        let gate = gate(N, a.scale.max(b.scale));
-        let across = || clique::vertices(a.set).flat_map(|m| clique::vertices(b.set).map(move |l| (m, l)));
+    /// Whether two disjoint sets deny each other: fewer than half of the pairs across agree at the gate. Two halves of one
+    /// truth, parted by a pair just outside the gate, do not.
+    pub(super) fn contradict(&self, a: Set, b: Set, gate: f64) -> bool {
+        let across = || clique::vertices(a).flat_map(|m| clique::vertices(b).map(move |l| (m, l)));
         2 * across().filter(|&(m, l)| self.agree(m, l, gate)).count() < across().count()
     }
 
@@ -61,26 +60,27 @@ impl Pairs {
         (0..self.n).map(neighbours).collect()
     }
 
-    /// Log₁₀ of the number of false alarms of `set` at a gate on d², and the member it is counted from.
+    /// Log₁₀ of the number of false alarms of `set`, and the member it is counted from.
     ///
-    /// Under chance a residual falls evenly into `volume`; it meets a hypothesis within the gate with the probability
-    /// α of the gate's ellipsoid. NFA = n S C(n−1, k) Π α over the k other members, S the number of scales tried; the
-    /// smallest over members as hypotheses.
-    pub(super) fn log10_nfa<const N: usize>(&self, set: Set, gate: f64, volume: f64, scales: usize) -> (f64, usize) {
+    /// Under chance a residual falls evenly into `volume`; it comes as near to a hypothesis as the set's worst member does
+    /// with the probability α of that ellipsoid. NFA = n (n − 1) C(n − 1, k) Π α over the k other members (n hypotheses,
+    /// n − 1 radii); the smallest over members as hypotheses. No set counts as nearer than true alignments are on average,
+    /// d² = N, so that one alignment told many times proves little.
+    pub(super) fn log10_nfa<const N: usize>(&self, set: Set, volume: f64) -> (f64, usize) {
         let k = f64::from(set.count_ones().saturating_sub(1));
         let n = self.n as f64;
-        let choices = log(n * scales as f64) + lgamma(n) - lgamma(k + 1.0) - lgamma(n - k);
-        let ball = log_ball_volume(N) + 0.5 * N as f64 * log(gate) - log(volume);
+        let choices = log(n * (n - 1.0).max(1.0)) + lgamma(n) - lgamma(k + 1.0) - lgamma(n - k);
         let mut best = (f64::INFINITY, 0);
         for hub in clique::vertices(set) {
-            let others = clique::vertices(set & !bit(hub));
-            let chance: f64 = others.map(|l| (ball + self.log_sqrt_det[hub * self.n + l]).min(0.0)).sum();
-            let nfa = (choices + chance) / core::f64::consts::LN_10;
-            if nfa < best.0 {
-                best = (nfa, hub);
+            let others = || clique::vertices(set & !bit(hub)).map(|l| hub * self.n + l);
+            let radius_squared = others().map(|at| self.distance_squared[at]).fold(N as f64, f64::max);
+            let ball = log_ball_volume(N) + 0.5 * N as f64 * log(radius_squared) - log(volume);
+            let chance: f64 = others().map(|at| (ball + self.log_sqrt_det[at]).min(0.0)).sum();
+            if chance < best.0 {
+                best = (chance, hub);
             }
         }
-        best
+        ((choices + best.0) / core::f64::consts::LN_10, best.1)
     }
 }
 

@@ -71,7 +71,7 @@ fn ten_true_beat_five_that_agree_on_a_lie() {
 #[test]
 fn four_true_never_lose_to_three_that_agree_on_a_lie() {
     let t = tally(draw(4, 3, 13), &config(3.0));
-    assert!(t.right >= 85 && t.wrong == 0 && t.right + t.ambiguous + t.weak == 100, "{t:?}");
+    assert!(t.right >= 97 && t.wrong == 0 && t.right + t.ambiguous + t.weak == 100, "{t:?}");
 }
 
 #[test]
@@ -83,7 +83,7 @@ fn equal_rivals_are_ambiguous() {
 #[test]
 fn alignments_three_times_noisier_than_they_say_still_merge() {
     let t = tally(Draw { under_reported: 3.0, ..draw(4, 0, 16) }, &config(3.0));
-    assert!(t.right >= 90 && t.wrong == 0, "{t:?}");
+    assert!(t.right >= 97 && t.wrong == 0, "{t:?}");
 }
 
 #[test]
@@ -162,8 +162,8 @@ fn swapped_frames_give_the_inverse() {
 #[test]
 fn the_gates_are_the_chi_squared_quantiles() {
     use statrs::distribution::{ChiSquared, ContinuousCDF};
-    for (freedom, quantile) in [6.0, 7.0].into_iter().zip(CHI2_99) {
-        assert!((ChiSquared::new(freedom).unwrap().cdf(quantile) - 0.99).abs() < 1e-12);
+    for (freedom, quantile) in [6.0, 7.0].into_iter().zip(CHI2_PAIR) {
+        assert!((ChiSquared::new(freedom).unwrap().cdf(quantile) - 0.999).abs() < 1e-12);
     }
 }
 

@@ -1,15 +1,15 @@
-//! A seeded world for tests: two robots drive the same figure-eight with drifting odometry, meet, and align; some
-//! alignments are false, some of those agree with each other (perceptual aliasing).
+//! A seeded world to measure the consensus on, for tests, benchmarks and the simulator's table: two robots drive the
+//! same figure-eight with drifting odometry, meet, and align; some alignments are false, some of those agree with each
+//! other (perceptual aliasing). The world of MATH §5's table; nothing in the agent uses it.
 
 use super::PairAlignment;
 use crate::estimate::trajectory::Trajectory;
-use crate::geometry::test_support::{normal, normals, rng, uniform};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3, se3};
 use core::f64::consts::PI;
 use libm::{cos, sin};
-use nalgebra::{Matrix3, Vector3, Vector6};
-use rand::RngExt;
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3, Vector6};
 use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 const ANCHORS: usize = 150;
@@ -18,30 +18,37 @@ const ALIGNMENT_SIGMAS: [f64; 2] = [0.05, 0.01];
 
 /// What is drawn.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Draw {
+pub struct Draw {
     /// Alignments that are true.
-    pub(super) real: usize,
+    pub real: usize,
     /// False alignments that agree with each other.
-    pub(super) aliased: usize,
+    pub aliased: usize,
     /// False alignments at random.
-    pub(super) random: usize,
+    pub random: usize,
     /// Factor by which true alignments are noisier than they claim.
-    pub(super) under_reported: f64,
+    pub under_reported: f64,
 }
 
-pub(super) struct World {
-    pub(super) alpha: Trajectory,
-    pub(super) beta: Trajectory,
-    pub(super) alignments: Vec<PairAlignment>,
+/// Two robots, what they measured, and the truth.
+#[derive(Clone, Debug)]
+pub struct World {
+    /// α's odometry.
+    pub alpha: Trajectory,
+    /// β's odometry.
+    pub beta: Trajectory,
+    /// Alignments, true and false, in random order.
+    pub alignments: Vec<PairAlignment>,
     /// Whether each alignment is true.
-    pub(super) real: Vec<bool>,
-    pub(super) t_alpha_beta: Se3,
+    pub real: Vec<bool>,
+    /// The truth.
+    pub t_alpha_beta: Se3,
     beta_centre: Vector3<f64>,
 }
 
 impl World {
-    pub(super) fn new(seed: u64, draw: Draw) -> Self {
-        let rng = &mut rng(seed);
+    /// The world of a seed.
+    pub fn new(seed: u64, draw: Draw) -> Self {
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let (start_a, start_b) = (uniform(rng, 0.0, 2.0 * PI), uniform(rng, 0.0, 2.0 * PI));
         let at = |start: f64, k: usize| circuit(start + 2.0 * PI * k as f64 / ANCHORS as f64);
         let true_a: Vec<Se3> = (0..ANCHORS).map(|k| at(start_a, k)).collect();
@@ -85,36 +92,41 @@ impl World {
     }
 
     /// Whether an estimate is right: within 8° and, at the middle of β's map, 3 m of the truth.
-    pub(super) fn is_right(&self, t_alpha_beta: &Se3) -> bool {
+    pub fn is_right(&self, t_alpha_beta: &Se3) -> bool {
         let error = self.t_alpha_beta.inverse() * *t_alpha_beta;
         let shift = (error * self.beta_centre - self.beta_centre).norm();
         error.rotation.angle() < 8.0_f64.to_radians() && shift < 3.0
     }
 
     /// Normalised estimation error squared.
-    pub(super) fn nees(&self, estimate: &PoseWithCovariance) -> f64 {
+    pub fn nees(&self, estimate: &PoseWithCovariance) -> f64 {
         estimate.covariance.mahalanobis_squared(&estimate.pose.local(&self.t_alpha_beta))
     }
 }
 
 /// A [`World`] whose β is in units of its own.
-pub(super) struct SimWorld {
-    pub(super) alpha: Trajectory,
-    pub(super) beta: Trajectory,
-    pub(super) alignments: Vec<PairAlignment<SimWithCovariance>>,
-    pub(super) t_alpha_beta: Sim3,
+#[derive(Clone, Debug)]
+pub struct SimWorld {
+    /// α's odometry, m.
+    pub alpha: Trajectory,
+    /// β's odometry, in its own unit.
+    pub beta: Trajectory,
+    /// Alignments, true and false.
+    pub alignments: Vec<PairAlignment<SimWithCovariance>>,
+    /// The truth.
+    pub t_alpha_beta: Sim3,
 }
 
 impl World {
     /// The same world, β's unit drawn between 0.2 and 5 m; true alignments measure it to 3 %, false ones tell any.
-    pub(super) fn with_unknown_scale(&self, seed: u64) -> SimWorld {
-        let rng = &mut rng(seed);
+    pub fn with_unknown_scale(&self, seed: u64) -> SimWorld {
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let unit = libm::exp(uniform(rng, -1.6, 1.6));
         // A length in metres is 1/unit of β's; so are translations' standard deviations.
         let mut beta = Trajectory::default();
         let mut previous = Se3::identity();
         for k in 0..self.beta.len() {
-            let anchor = self.beta.pose(k).unwrap();
+            let anchor = self.beta.pose(k).unwrap_or_else(Se3::identity);
             let step = previous.inverse() * anchor;
             let sigmas = if k == 0 { [1e-8, 1e-8] } else { [ODOMETRY_SIGMAS[0] / unit, ODOMETRY_SIGMAS[1]] };
             let pose = Se3::new(step.rotation, step.translation / unit);
@@ -122,7 +134,7 @@ impl World {
             previous = anchor;
         }
         let [m, r] = ALIGNMENT_SIGMAS;
-        let of_alignment = Covariance::from_sigmas([m / unit, m / unit, m / unit, r, r, r, 0.03]).unwrap();
+        let of_alignment = covariance_of([m / unit, m / unit, m / unit, r, r, r, 0.03]);
         let alignments = self.alignments.iter().zip(&self.real).map(|(a, &real)| {
             let told = if real { 0.03 * normal(rng) } else { uniform(rng, -1.0, 1.0) };
             let sim = Sim3::new(a.t_i_j.pose.rotation, a.t_i_j.pose.translation, unit * libm::exp(told));
@@ -170,5 +182,23 @@ fn scaled(rng: &mut ChaCha8Rng, [metres, radians]: [f64; 2]) -> Vector6<f64> {
 }
 
 fn covariance([m, r]: [f64; 2]) -> Covariance<6> {
-    Covariance::from_sigmas([m, m, m, r, r, r]).unwrap()
+    covariance_of([m, m, m, r, r, r])
+}
+
+fn covariance_of<const N: usize>(sigmas: [f64; N]) -> Covariance<N> {
+    Covariance::new_or_wider(SMatrix::from_diagonal(&SVector::from(sigmas.map(|s| s * s))))
+}
+
+fn uniform(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
+    low + (high - low) * rng.random::<f64>()
+}
+
+/// Standard normal (Box–Muller).
+fn normal(rng: &mut ChaCha8Rng) -> f64 {
+    let (u, v) = (1.0 - rng.random::<f64>(), rng.random::<f64>());
+    libm::sqrt(-2.0 * libm::log(u)) * cos(2.0 * PI * v)
+}
+
+fn normals<const N: usize>(rng: &mut ChaCha8Rng) -> SVector<f64, N> {
+    SVector::from_fn(|_, _| normal(rng))
 }

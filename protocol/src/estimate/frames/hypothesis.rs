@@ -1,0 +1,82 @@
+//! One explanation of the alignments: a set that agrees, what it says of T_αβ, and how unlikely chance is to do as well.
+
+use super::FrameConsensus;
+use super::clique::{self, Set, bit};
+use super::gls::Gls;
+use super::measured::Measured;
+use super::pairs::Pairs;
+use super::predict::surprise;
+use crate::geometry::{Covariance, Group};
+
+/// A member this improbable, given what the others predict, is none.
+const SURPRISE_MIN: f64 = 1e-3;
+/// A settled set of alignments.
+pub(super) struct Hypothesis<const N: usize, G> {
+    pub(super) set: Set,
+    /// Covariance scale of the gate that found it.
+    pub(super) scale: f64,
+    pub(super) log10_nfa: f64,
+    /// Of the sets found at that gate, whether it was the largest.
+    pub(super) largest: bool,
+    gls: Gls<N, G>,
+}
+
+impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
+    /// Estimates over `set`; drops, worst first, members that the others do not predict.
+    pub(super) fn settle(
+        measured: &Measured<'_, N, G>,
+        pairs: &Pairs,
+        mut set: Set,
+        scale: f64,
+        largest: bool,
+    ) -> Option<Self> {
+        loop {
+            let (log10_nfa, hub) = pairs.log10_nfa::<N>(set, measured.search_volume());
+            let gls = Gls::solve(measured, set, hub)?;
+            match unpredicted(measured, set, &gls) {
+                0 => return Some(Self { set, scale, log10_nfa, largest, gls }),
+                some => set &= !some,
+            }
+        }
+    }
+
+    /// Squared distance of member `l` from what the others predict.
+    pub(super) fn left_out(&self, l: usize) -> f64 {
+        self.gls.left_out.get((self.set & (bit(l) - 1)).count_ones() as usize).copied().unwrap_or(0.0)
+    }
+
+    /// As an answer to the caller.
+    pub(super) fn consensus(&self, measured: &Measured<'_, N, G>) -> FrameConsensus<(G, Covariance<N>)> {
+        let scale_max = measured.config.covariance_scale_max.max(1.0);
+        let freedom = N as f64 * f64::from(self.set.count_ones() - 1).max(1.0);
+        // A χ² that chance exceeds once in fifty times says nothing against the stated covariances.
+        let excess = self.gls.chi_squared / freedom;
+        let significant = excess > 1.0 + 2.33 * (2.0 / freedom).sqrt();
+        let scale_squared = if significant { excess.clamp(1.0, scale_max * scale_max) } else { 1.0 };
+        let mut used: Vec<usize> = clique::vertices(self.set).map(|l| measured.alignments[l].position).collect();
+        used.sort_unstable();
+        FrameConsensus {
+            t_alpha_beta: (self.gls.t_alpha_beta, Covariance::new_or_wider(self.gls.covariance * scale_squared)),
+            used,
+            covariance_scale: scale_squared.sqrt(),
+            log10_nfa: self.log10_nfa,
+        }
+    }
+}
+
+/// The worst of the members that the others do not predict: a sixteenth of the set, but at least one, at a time, since
+/// one bad member spoils the prediction of others. Two members always stay.
+fn unpredicted<const N: usize, G: Group<N>>(measured: &Measured<'_, N, G>, set: Set, gls: &Gls<N, G>) -> Set {
+    let scales = measured.scales();
+    let mut outside: Vec<(f64, usize)> = gls
+        .left_out
+        .iter()
+        .zip(clique::vertices(set))
+        .map(|(&d2, l)| (surprise::<N>(d2, gls.others(d2), &scales), l))
+        .filter(|&(p, _)| p < SURPRISE_MIN)
+        .collect();
+    outside.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let members = gls.left_out.len();
+    let dropped = (members / 16).max(1).min(members.saturating_sub(2));
+    outside.iter().take(dropped).map(|&(_, l)| bit(l)).sum()
+}
