@@ -34,6 +34,12 @@ pub(super) fn maximum_clique(adjacency: &[Set], candidates: Set) -> Set {
     search.best
 }
 
+/// `clique` with as many more vertices of `candidates` as agree with all of it and with each other.
+pub(super) fn grown(adjacency: &[Set], clique: Set, candidates: Set) -> Set {
+    let agreeing = vertices(clique).fold(candidates & !clique, |common, v| common & adjacency[v]);
+    clique | maximum_clique(adjacency, agreeing)
+}
+
 struct Search<'a> {
     adjacency: &'a [Set],
     best: Set,

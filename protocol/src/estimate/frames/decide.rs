@@ -45,7 +45,9 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
         }
     }
 
-    /// What the alignments may mean: the largest sets that agree at each scale, settled; the tightest scale first.
+    /// What the alignments may mean: the largest sets that agree at each scale, settled; the tightest scale first. Each
+    /// next set is sought among what the ones before left, and again with what these took but agrees with it: a lie that
+    /// by accident took a member of the truth must not look the stronger for it.
     fn hypotheses(&self, pairs: &Pairs) -> Vec<Hypothesis<N, G>> {
         let everyone: Set = (0..self.alignments.len()).map(bit).sum();
         let mut tried: Vec<Set> = Vec::new();
@@ -59,10 +61,12 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
                     break;
                 }
                 left &= !set;
-                if !tried.contains(&set) {
-                    tried.push(set);
-                    let settled = Hypothesis::settle(self, pairs, set, scale, rank == 0);
-                    found.extend(settled.filter(|h| found.iter().all(|f| f.set != h.set)));
+                for set in [set, clique::grown(&graph, set, everyone)] {
+                    if !tried.contains(&set) {
+                        tried.push(set);
+                        let settled = Hypothesis::settle(self, pairs, set, scale, rank == 0);
+                        found.extend(settled.filter(|h| found.iter().all(|f| f.set != h.set)));
+                    }
                 }
             }
         }
@@ -100,13 +104,14 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
     ) -> Option<(&'h Hypothesis<N, G>, &'h Hypothesis<N, G>)> {
         let contenders = hypotheses.iter().filter(|h| h.log10_nfa <= best.log10_nfa + BLEND_MARGIN_LOG10);
         core::iter::once(best).chain(contenders).find_map(|first| {
-            let second = hypotheses.iter().find(|second| self.rival(pairs, first, second))?;
+            let is_best = first.set == best.set;
+            let second = hypotheses.iter().find(|second| self.rival(pairs, first, second, is_best))?;
             Some((first, second))
         })
     }
 
     /// Whether `second` contradicts `first` and does about as well, each left with the members that it predicts better.
-    fn rival(&self, pairs: &Pairs, first: &Hypothesis<N, G>, second: &Hypothesis<N, G>) -> bool {
+    fn rival(&self, pairs: &Pairs, first: &Hypothesis<N, G>, second: &Hypothesis<N, G>, is_best: bool) -> bool {
         let shared = clique::vertices(first.set & second.set);
         let seconds: Set = shared.filter(|&l| second.left_out(l) < first.left_out(l)).map(bit).sum();
         let of_first = first.set & !seconds;
@@ -116,8 +121,11 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
         let stray = |&l: &usize| nfa(of_first & !bit(l)) <= nfa(of_first) + STRAY_MARGIN_LOG10;
         let (all, rival) = (of_first.count_ones() as usize, of_second.count_ones() as usize);
         let earned = all - clique::vertices(of_first).filter(stray).count();
-        let as_good = rival as f64 >= RIVAL_SHARE * earned as f64 && all as f64 >= RIVAL_SHARE * rival as f64;
+        let as_good = rival as f64 >= RIVAL_SHARE * earned as f64;
+        // What is about to merge must not be outnumbered; any other pair of sets is of interest only if it is even.
+        let even = is_best || all as f64 >= RIVAL_SHARE * rival as f64;
         as_good
+            && even
             && nfa(of_second) <= self.config.log10_nfa_max
             && pairs.contradict(of_first, of_second, gate(N, first.scale.max(second.scale)))
     }
