@@ -12,6 +12,10 @@ use crate::geometry::{Covariance, Group};
 const SETS_A_SCALE: usize = 3;
 /// A rival with this share of the best set's members makes the frames ambiguous.
 const RIVAL_SHARE: f64 = 0.8;
+/// A rival also counts what it lost by little: at standard deviations larger by this factor. *Measured* over 1,200 worlds
+/// of four true alignments against four of one lie: wrong merges fall from 0.6 to 0.25 %, right ones of 4 against 3 from
+/// 97.9 to 97.2 %.
+const RIVAL_REACH: f64 = 1.2;
 /// A set that agrees at a tighter gate is preferred, or searched for rivals, within this many powers of ten of the best.
 const BLEND_MARGIN_LOG10: f64 = 4.0;
 /// A member that only a wider gate admits must lower the NFA by this many powers of ten.
@@ -45,11 +49,15 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
         }
     }
 
+    fn everyone(&self) -> Set {
+        (0..self.alignments.len()).map(bit).sum()
+    }
+
     /// What the alignments may mean: the largest sets that agree at each scale, settled; the tightest scale first. Each
     /// next set is sought among what the ones before left, and again with what these took but agrees with it: a lie that
     /// by accident took a member of the truth must not look the stronger for it.
     fn hypotheses(&self, pairs: &Pairs) -> Vec<Hypothesis<N, G>> {
-        let everyone: Set = (0..self.alignments.len()).map(bit).sum();
+        let everyone = self.everyone();
         let mut tried: Vec<Set> = Vec::new();
         let mut found: Vec<Hypothesis<N, G>> = Vec::new();
         for scale in self.scales() {
@@ -119,7 +127,9 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
         let nfa = |set| pairs.log10_nfa::<N>(set, self.search_volume()).0;
         // A member without which the first is as good does not outweigh the second.
         let stray = |&l: &usize| nfa(of_first & !bit(l)) <= nfa(of_first) + STRAY_MARGIN_LOG10;
-        let (all, rival) = (of_first.count_ones() as usize, of_second.count_ones() as usize);
+        let reach = pairs.graph(gate(N, RIVAL_REACH * second.scale));
+        let of_second_and_near = clique::grown(&reach, of_second, self.everyone() & !of_first);
+        let (all, rival) = (of_first.count_ones() as usize, of_second_and_near.count_ones() as usize);
         let earned = all - clique::vertices(of_first).filter(stray).count();
         let as_good = rival as f64 >= RIVAL_SHARE * earned as f64;
         // What is about to merge must not be outnumbered; any other pair of sets is of interest only if it is even.
