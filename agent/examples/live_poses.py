@@ -6,8 +6,7 @@ config = zenoh.Config()
 if len(sys.argv) > 1:
     config.insert_json5("connect/endpoints", json.dumps(sys.argv[1:]))
 with zenoh.open(config) as session:
-    subscriber = session.declare_subscriber("merganser/v1/*/*/view/poses")
-    for sample in subscriber:
+    for sample in session.declare_subscriber("merganser/v1/*/*/view/poses"):
         observer = str(sample.key_expr).split("/")[3]
         for robot in json.loads(sample.payload.to_string())["robots"]:
             if robot["t_own_body"]:

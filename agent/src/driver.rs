@@ -303,10 +303,7 @@ impl<C: Core, N: Network> Driver<C, N> {
 /// Logs an event: WARN for what an operator should look into, ERROR for what needs him.
 fn tell(event: &Event) {
     match event {
-        Event::Rejected { peer, reason, suppressed } => {
-            let peer = peer.map_or("unknown".to_string(), |peer| peer.to_string());
-            warn!(peer, reason, suppressed, "refused input");
-        }
+        Event::Rejected { name, reason, suppressed, .. } => warn!(peer = name, reason, suppressed, "refused input"),
         Event::ReceiveOnly { reason } => error!(reason, "the store failed: no facts of our own are written any more"),
         Event::Merged { frame } => info!(%frame, "merged"),
         Event::Unmerged { frame } => warn!(%frame, "no longer merged"),

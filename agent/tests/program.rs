@@ -142,6 +142,47 @@ fn an_agent_that_is_ended_in_mid_drive_keeps_the_submap_it_was_in() {
 }
 
 #[test]
+fn a_bad_cloud_ends_the_agent_with_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path();
+    recording(&folder.join("walk"));
+    let cloud = folder.join("walk/2.bin");
+    let bytes = std::fs::read(&cloud).unwrap();
+    std::fs::write(&cloud, &bytes[..bytes.len() - 1]).unwrap();
+    write_configs(folder, &["alpha"]);
+    let ended = spawn(&["run", "-c", "alpha.toml", "--recording", "walk", "--speed", "100"], folder);
+    let ended = ended.wait_with_output().unwrap();
+    assert_eq!(ended.status.code(), Some(1));
+    assert!(text(&ended.stderr).contains("2.bin"), "{}", text(&ended.stderr));
+}
+
+#[test]
+fn an_agent_on_a_leash_ends_with_its_parent() {
+    let dir = tempfile::tempdir().unwrap();
+    write_configs(dir.path(), &["alpha"]);
+    let mut agent = Command::new(PROGRAM)
+        .args(["run", "-c", "alpha.toml", "--leash"])
+        .current_dir(dir.path())
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    assert!(agent.try_wait().unwrap().is_none(), "it runs as long as the pipe is open");
+    drop(agent.stdin.take());
+    let deadline = Instant::now() + PATIENCE;
+    let status = loop {
+        if let Some(status) = agent.try_wait().unwrap() {
+            break status;
+        }
+        assert!(Instant::now() < deadline);
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    };
+    assert_eq!(status.code(), Some(0));
+}
+
+#[test]
 fn a_stopped_watch_without_robots_says_so_with_its_exit_code() {
     let dir = tempfile::tempdir().unwrap();
     let watch = ["watch", "--no-multicast", "--for", "1.5"];

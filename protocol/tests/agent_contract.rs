@@ -106,15 +106,17 @@ fn ten_thousand_facts_of_strangers_are_counted_reported_once_and_forgotten() {
         alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: stranger, epoch: 1 }, seq: 0 },
         outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
     });
-    let entry = theirs.append(&key, 1, &verdict).unwrap().encode();
-    let bytes = Message::Facts(vec![EntryBytes(entry)]).encode();
     let mut reports = 0;
     for n in 0..10_000u64 {
         let now = Instant::ZERO.after(Duration::from_millis(n));
-        agent.handle(now, Input::Received { from: stranger, channel: Channel::Facts, bytes: bytes.clone() });
+        // Each another entry of her log, rightly signed.
+        let entry = theirs.append(&key, 1, &verdict).unwrap().encode();
+        let bytes = Message::Facts(vec![EntryBytes(entry)]).encode();
+        agent.handle(now, Input::Received { from: stranger, channel: Channel::Facts, bytes });
         for output in drain(&mut agent) {
             match output {
-                Output::Event(Event::Rejected { peer, .. }) => {
+                Output::Event(Event::Rejected { peer, name, .. }) => {
+                    assert_eq!(name, stranger.to_string(), "she is in no roster: her id must do");
                     assert_eq!(peer, Some(stranger), "the warning names the peer");
                     reports += 1;
                 }
@@ -126,6 +128,9 @@ fn ten_thousand_facts_of_strangers_are_counted_reported_once_and_forgotten() {
     let stats = agent.snapshot(Instant::ZERO).stats;
     assert_eq!(stats.rejected.values().sum::<u64>(), 10_000);
     assert_eq!(reports, 1, "one report per peer and ten seconds");
+    assert_eq!(stats.rejected_by_peer.len(), 1);
+    let shown = serde_json::to_string(&agent.snapshot(Instant::ZERO)).unwrap();
+    assert!(shown.len() < 4096, "nothing of them is kept: {shown}");
     assert_eq!(agent.status().entries, 0);
 }
 

@@ -105,9 +105,9 @@ fn dispatch(command: Command) -> anyhow::Result<bool> {
         Command::Run { scenario: path, seed, seeds, report, twice } => {
             let scenario = load(&path)?;
             say(&format!("# {} — every option of this run:\n{}", path.display(), toml::to_string(&scenario)?))?;
-            let band = seeds.unwrap_or(Band(seed, seed + 1));
+            let (first, last) = seeds.map_or((seed, seed), |band| (band.0, band.1 - 1));
             let mut good = true;
-            for seed in band.0..band.1 {
+            for seed in first..=last {
                 let folder = report.as_ref().map(|dir| match seeds {
                     Some(_) => dir.join(seed.to_string()),
                     None => dir.clone(),

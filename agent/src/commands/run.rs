@@ -16,10 +16,10 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
-use tracing::{error, info, warn};
+use tracing::{info, warn};
 
 /// Time between two warnings about what was dropped.
-const DROPS_EVERY: Duration = Duration::from_secs(5);
+const DROPS_EVERY: Duration = Duration::from_secs(10);
 /// Keyframes read ahead of their time.
 const READ_AHEAD: usize = 4;
 
@@ -44,6 +44,9 @@ pub struct RunArgs {
     /// Seed of the core's random choices; the system's randomness if absent.
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
+    /// End when the standard input is closed: a parent that is killed then leaves no agent behind.
+    #[arg(long, hide = true)]
+    pub leash: bool,
 }
 
 fn speed(text: &str) -> Result<f64, String> {
@@ -76,18 +79,40 @@ async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recordin
     }
     let mut host = Host::start(config, Options { journal: args.journal.clone(), seed: args.seed }).await?;
     let inbox = host.inbox().clone();
-    let side = [
-        tokio::spawn(tell_drops(inbox.drops.clone())),
-        tokio::spawn(feed(inbox, args.new_epoch, recording, args.speed)),
-    ];
-    let broken = tokio::select! {
-        () = stop => None,
-        error = host.broken() => Some(error),
+    let drops = tokio::spawn(tell_drops(inbox.drops.clone()));
+    let feed = tokio::spawn(feed(inbox, args.new_epoch, recording, args.speed));
+    let feeding = feed.abort_handle();
+    let ended = tokio::select! {
+        () = stop => Ok(()),
+        () = let_go(args.leash) => Ok(()),
+        error = host.broken() => return Err(error.into()),
+        bad = bad_feed(feed) => Err(bad),
     };
-    side.iter().for_each(tokio::task::JoinHandle::abort);
-    match broken {
-        Some(error) => Err(error.into()),
-        None => Ok(host.stop().await?),
+    [drops.abort_handle(), feeding].iter().for_each(tokio::task::AbortHandle::abort);
+    let finished = host.stop().await?;
+    ended.map(|()| finished)
+}
+
+/// Completes when whoever held the other end of the standard input is gone.
+async fn let_go(leash: bool) {
+    let (sender, receiver) = tokio::sync::oneshot::channel();
+    if leash {
+        // A thread of its own: reading cannot be given up, and must not keep the runtime from ending.
+        std::thread::spawn(move || {
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+            let _ = sender.send(());
+        });
+        let _ = receiver.await;
+    } else {
+        std::future::pending().await
+    }
+}
+
+/// Completes with what was wrong with the recording; never, if it is good.
+async fn bad_feed(feed: tokio::task::JoinHandle<Result<()>>) -> anyhow::Error {
+    match feed.await {
+        Ok(Err(bad)) => bad,
+        _ => std::future::pending().await,
     }
 }
 
@@ -131,17 +156,18 @@ async fn tell_drops(drops: Arc<Drops>) {
     }
 }
 
-async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recording>, speed: f64) {
+async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recording>, speed: f64) -> Result<()> {
     if new_epoch {
         inbox.feed(Input::Command(Command::NewEpoch)).await;
     }
-    if let Some(recording) = recording {
-        play(&inbox, recording, speed).await;
+    match recording {
+        Some(recording) => play(&inbox, recording, speed).await,
+        None => Ok(()),
     }
 }
 
 /// Feeds a recording in its own time, `speed` times faster, and closes the last submap.
-async fn play(inbox: &Inbox, recording: Recording, speed: f64) {
+async fn play(inbox: &Inbox, recording: Recording, speed: f64) -> Result<()> {
     let (sender, mut keyframes) = mpsc::channel(READ_AHEAD);
     let reader = tokio::task::spawn_blocking(move || {
         for index in 0..recording.len() {
@@ -153,22 +179,17 @@ async fn play(inbox: &Inbox, recording: Recording, speed: f64) {
     let mut origin: Option<(tokio::time::Instant, Stamp)> = None;
     let mut fed = 0_u64;
     while let Some(keyframe) = keyframes.recv().await {
-        let keyframe = match keyframe {
-            Ok(keyframe) => keyframe,
-            Err(reason) => {
-                error!(%reason, "the recording ends here");
-                break;
-            }
-        };
+        let keyframe = keyframe.context("the recording ends here")?;
         let (start, first) = *origin.get_or_insert((tokio::time::Instant::now(), keyframe.stamp));
         let ahead = keyframe.stamp.secs_since(first) / speed;
         tokio::time::sleep_until(start + Duration::try_from_secs_f64(ahead).unwrap_or_default()).await;
         if !inbox.feed(Input::Keyframe(keyframe)).await {
-            return;
+            return Ok(());
         }
         fed += 1;
     }
     inbox.feed(Input::Command(Command::Flush)).await;
     info!(keyframes = fed, "recording fed");
     drop(reader);
+    Ok(())
 }

@@ -46,15 +46,22 @@ pub struct WatchArgs {
     #[arg(long)]
     pub json: bool,
     /// Stop after so many seconds.
-    #[arg(long = "for", value_name = "SECS")]
+    #[arg(long = "for", value_name = "SECS", value_parser = secs)]
     pub secs: Option<f64>,
     /// Seconds between two tables.
-    #[arg(long, value_name = "SECS", default_value_t = 1.0, conflicts_with = "json")]
+    #[arg(long, value_name = "SECS", default_value_t = 1.0, conflicts_with = "json", value_parser = secs)]
     pub interval: f64,
 }
 
 fn name(text: &str) -> Result<Name, String> {
     Name::new(text).map_err(|error| error.to_string())
+}
+
+fn secs(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(secs) if (0.01..=1e9).contains(&secs) => Ok(secs),
+        _ => Err("use a number from 0.01 to 1000000000".into()),
+    }
 }
 
 /// Watches until the time is over or a signal comes; false if nothing was seen at all.

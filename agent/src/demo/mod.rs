@@ -81,6 +81,7 @@ pub fn run(args: DemoArgs) -> Result<bool> {
     let out = args.out.clone().unwrap_or_else(default_out);
     let work = fresh(&out)?;
     let (recordings, bounds) = prepare(&args, &work)?;
+    outputs::remove_old(&out)?;
     let tracks: Vec<Track> = recordings.iter().map(Track::of).collect();
     say(&format!("{} robots, each with its own recording, local frame and process", recordings.len()))?;
     say(&report::recordings(&recordings, args.speed))?;
@@ -149,7 +150,9 @@ fn prepare(args: &DemoArgs, work: &Path) -> Result<(Vec<Recording>, Bounds)> {
         Kind::SevenScenes => Bounds { translation_m: 0.05, rotation_deg: 2.0 },
         Kind::Lidar => Bounds { translation_m: 0.75, rotation_deg: 2.0 },
     };
-    Ok((import::prepare(data, &folder, args.seed)?, bounds))
+    let recordings = import::prepare(data, &folder, args.seed)?;
+    recordings.iter().try_for_each(Recording::check_clouds)?;
+    Ok((recordings, bounds))
 }
 
 fn write(

@@ -16,6 +16,11 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+/// Names of the files, beside a `robot_*.tum` each.
+const MERGED: &str = "merged.ply";
+const ALIGNMENTS: &str = "alignments.json";
+const PNG: &str = "merge.png";
+const SVG: &str = "merge.svg";
 /// The merged map is thinned to one point per robot in cubes of this share of the submaps' voxel.
 const THIN: f64 = 0.5;
 /// Robots' colours, told apart by colour-blind people too (Okabe and Ito).
@@ -52,17 +57,35 @@ pub(super) fn write(result: &Outcome, folder: &Path) -> Result<Vec<PathBuf>> {
         written.push(path);
         Ok(())
     };
-    put("merged.ply".into(), merged_ply(&clouds))?;
+    put(MERGED.into(), merged_ply(&clouds))?;
     for (track, corrected) in result.tracks.iter().zip(&result.evaluation.corrected) {
         if let Some(corrected) = corrected {
             put(format!("robot_{}.tum", track.name), tum(&track.stamps_secs, &corrected.poses).into())?;
         }
     }
-    put("alignments.json".into(), serde_json::to_vec_pretty(&alignments(result))?)?;
+    put(ALIGNMENTS.into(), serde_json::to_vec_pretty(&alignments(result))?)?;
     let svg = picture::draw(&scene::scene(result, &clouds));
-    put("merge.png".into(), picture::png(&svg, 1.0)?)?;
-    put("merge.svg".into(), svg.into())?;
+    put(PNG.into(), picture::png(&svg, 1.0)?)?;
+    put(SVG.into(), svg.into())?;
     Ok(written)
+}
+
+/// Removes what an earlier run left, so that nothing of it passes for this one's. A folder without [`MERGED`] is
+/// nobody's but the user's, and is left as it is.
+pub(super) fn remove_old(folder: &Path) -> Result<()> {
+    if !folder.join(MERGED).is_file() {
+        return Ok(());
+    }
+    for entry in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
+        let path = entry?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let ours = [MERGED, ALIGNMENTS, PNG, SVG].contains(&name.as_str())
+            || (name.starts_with("robot_") && name.ends_with(".tum"));
+        if ours && path.is_file() {
+            fs::remove_file(&path).with_context(|| path.display().to_string())?;
+        }
+    }
+    Ok(())
 }
 
 /// Reads all clouds of a recording, thinned.

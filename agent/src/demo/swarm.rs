@@ -60,7 +60,8 @@ impl Swarm {
                 .arg("run")
                 .args([Path::new("--config"), &path, Path::new("--recording"), recording.folder()])
                 .args(["--speed", &speed.to_string(), "--seed", &(seed.wrapping_add(index as u64)).to_string()])
-                .stdin(Stdio::null())
+                .arg("--leash")
+                .stdin(Stdio::piped()) // closed when we end, however we end
                 .stdout(out.try_clone().with_context(|| log.display().to_string())?)
                 .stderr(out)
                 .spawn()

@@ -57,7 +57,7 @@ pub(super) async fn start(shared: &Arc<Shared>) -> Result<JoinHandle<()>, LinkEr
 
 fn broadcast(shared: &Shared, present: &watch::Sender<BTreeSet<RobotId>>, channel: Channel, sample: &Sample) {
     let Some((name, from)) = sender(shared, sample) else {
-        return shared.drops().count("refused: broadcast of a robot that is not in the roster");
+        return shared.drops().count(format!("refused: broadcast of {}, who is not in the roster", stranger(sample)));
     };
     if sample.payload().len() > PEER_BYTES_MAX {
         return shared.drops().count(format!("refused: {name} broadcast more than {PEER_BYTES_MAX} bytes"));
@@ -105,7 +105,7 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
 
 fn alive(shared: &Shared, present: &watch::Sender<BTreeSet<RobotId>>, sample: &Sample) {
     let Some((name, robot)) = sender(shared, sample) else {
-        return shared.drops().count("ignored: a robot that is not in the roster is alive");
+        return shared.drops().count(format!("ignored: {} is alive, who is not in the roster", stranger(sample)));
     };
     if name != shared.robot {
         present.send_if_modified(|robots| match sample.kind() {
@@ -136,6 +136,12 @@ fn sender(shared: &Shared, sample: &Sample) -> Option<(Name, RobotId)> {
     let (name, _) = keys::split(sample.key_expr().as_str())?;
     let id = *shared.ids.get(&name)?;
     Some((name, id))
+}
+
+/// What a sender outside the roster calls itself. Names are short; how many are told apart is bounded where they are
+/// counted.
+fn stranger(sample: &Sample) -> String {
+    keys::split(sample.key_expr().as_str()).map_or_else(|| "somebody".to_owned(), |(name, _)| name.to_string())
 }
 
 /// JSON or postcard. A sample of no stated encoding is taken for postcard.

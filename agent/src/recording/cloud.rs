@@ -4,6 +4,7 @@
 
 use super::error::{Problem, RecordingError, on};
 use super::{pcd, ply};
+use crate::observation::COORDINATE_MAX;
 use merganser_protocol::recording::{CloudFormat, XYZ_I16_UNIT_M};
 use std::fs::File;
 use std::io::Read;
@@ -64,7 +65,7 @@ fn parse(bytes: &[u8], format: CloudFormat) -> Result<Vec<[f32; 3]>, Fault> {
     if points.is_empty() {
         return Err(Problem::CloudEmpty.into());
     }
-    match points.iter().position(|point| point.iter().any(|c| !c.is_finite())) {
+    match points.iter().position(|point| point.iter().any(|c| !(f64::from(c.abs()) <= COORDINATE_MAX))) {
         Some(index) => Err(Problem::Point(index).into()),
         None => Ok(points),
     }

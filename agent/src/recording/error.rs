@@ -2,6 +2,7 @@
 //! the line.
 
 use super::cloud::{CLOUD_BYTES_MAX, POINTS_MAX};
+use crate::observation::COORDINATE_MAX;
 use merganser_protocol::config::ConfigError;
 use merganser_protocol::geometry::CovarianceError;
 use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, VERSION};
@@ -69,6 +70,9 @@ pub enum Problem {
         /// What it holds.
         value: f64,
     },
+    /// A position is too far from the origin for clouds in f32 and poses in f64.
+    #[error("the position is beyond {COORDINATE_MAX:e} m; use a local frame")]
+    Far,
     /// A quaternion has no direction.
     #[error("the quaternion has length {0}; write a unit quaternion as qx,qy,qz,qw")]
     Quaternion(f64),
@@ -136,8 +140,8 @@ pub enum Problem {
     /// A file has too many bytes.
     #[error("the file has {0} bytes; at most {CLOUD_BYTES_MAX} (CLOUD_BYTES_MAX) are read: thin the cloud")]
     CloudBytes(u64),
-    /// A point is NaN or infinite.
-    #[error("point {0} (counted from 0) is not finite; leave invalid returns out")]
+    /// A point is NaN, infinite or absurdly far.
+    #[error("point {0} (counted from 0) is not finite or beyond {COORDINATE_MAX:e} m; leave invalid returns out")]
     Point(usize),
     /// A PLY file is not as expected.
     #[error("{0}")]

@@ -3,7 +3,7 @@
 //! drift on its true motion, and its manifest says so.
 
 use super::error::{Problem, RecordingError, on};
-use super::{Drift, MANIFEST, Recording, Writer, import_lidar, import_rgbd};
+use super::{Drift, KEYFRAMES, MANIFEST, Recording, Writer, import_lidar, import_rgbd};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::ids::Name;
@@ -89,7 +89,8 @@ pub fn open_all(folder: &Path) -> Result<Vec<Recording>, RecordingError> {
     let mut folders = Vec::new();
     for entry in on(folder, folder.read_dir())? {
         let path = on(folder, entry)?.path();
-        if path.join(MANIFEST).is_file() {
+        // A robot whose manifest is missing must not be left out in silence.
+        if path.join(MANIFEST).exists() || path.join(KEYFRAMES).exists() {
             folders.push(path);
         }
     }

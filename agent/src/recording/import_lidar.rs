@@ -45,6 +45,13 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
         }
         (read_poses(&data.join(POSES))?, CloudFormat::KittiBin, source)
     };
+    for scan in numbered(data, format)? {
+        if !poses.contains_key(&scan) {
+            let why = format!("scan {scan:06} has no pose; state it, or take the scan away");
+            return Err(Problem::Data(why).of(data));
+        }
+    }
+    let stated = poses.len();
     let scans: Vec<Scan> = poses
         .into_iter()
         .map(|(index, truth)| Scan { stamp: Stamp(i64::from(index) * SCAN_NANOS), truth, source: source(data, index) })
@@ -59,9 +66,24 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
     config.submap.voxel_m = 0.5;
     config.submap.distance_m = 10.0;
     config.submap.keyframes_max = (scans.len() / (robots * SUBMAPS_PER_ROBOT)).clamp(1, 10) as u32;
-    let origin = format!("{} LiDAR scans cut into {robots} robots by time", scans.len());
+    let origin = format!("{} LiDAR scans ({stated} poses) cut into {robots} robots by time", scans.len());
     let cut = Cut { robots, sensor: "lidar3d", origin, drift: DRIFT, seed, config };
     cut.write(&scans, out, |scan| cloud::read(&scan.source, format))
+}
+
+/// Numbers of the scans in a folder: files `NNNNNN.bin`, or folders `NNNNNN` with points.
+fn numbered(data: &Path, format: CloudFormat) -> Result<Vec<u32>, RecordingError> {
+    let mut numbers = Vec::new();
+    for entry in on(data, data.read_dir())? {
+        let path = on(data, entry)?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let number = match format {
+            CloudFormat::KittiBin => name.strip_suffix(SCAN_SUFFIX),
+            _ => path.join("points.bin").is_file().then_some(&*name),
+        };
+        numbers.extend(number.and_then(|number| number.parse::<u32>().ok()));
+    }
+    Ok(numbers)
 }
 
 /// `t_world_lidar` by the scan's number.

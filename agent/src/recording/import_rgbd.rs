@@ -6,7 +6,7 @@ use super::Drift;
 use super::cloud::read_bytes;
 use super::error::{Problem, RecordingError, on};
 use super::import::{Cut, Scan};
-use super::table::number;
+use super::table::{near, number};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::{Se3, So3};
 use merganser_protocol::time::Stamp;
@@ -22,6 +22,8 @@ const INTRINSICS: &str = "camera-intrinsics.txt";
 const POSES: &str = "poses_all_1000.txt";
 /// Depth used, mm: nearer is noise, farther is coarse.
 const DEPTH_MM: std::ops::RangeInclusive<u16> = 300..=4000;
+/// Pixels of a depth image at most: a header must not make us allocate what no camera fills.
+const PIXELS_MAX: u64 = 1 << 24;
 /// Every so many pixels of every so many rows.
 const STRIDE: usize = 6;
 /// The camera's rate.
@@ -113,7 +115,7 @@ pub(super) fn rigid(m: &Matrix4<f64>) -> Result<Se3, Problem> {
     if off > ROTATION_ERROR_MAX {
         return Err(Problem::Rotation(off));
     }
-    Ok(Se3::new(So3::from_matrix(&r), Vector3::new(m[(0, 3)], m[(1, 3)], m[(2, 3)])))
+    near(Se3::new(So3::from_matrix(&r), Vector3::new(m[(0, 3)], m[(1, 3)], m[(2, 3)])))
 }
 
 /// The points of a depth image, in the camera's frame.
@@ -122,6 +124,9 @@ fn read_depth(path: &Path, camera: &Camera) -> Result<Vec<[f32; 3]>, RecordingEr
     let told = |error: png::DecodingError| Problem::Image(error.to_string()).of(path);
     let mut reader = png::Decoder::new(Cursor::new(bytes)).read_info().map_err(told)?;
     let (width, kind) = (reader.info().width as usize, reader.output_color_type());
+    if u64::from(reader.info().width) * u64::from(reader.info().height) > PIXELS_MAX {
+        return Err(Problem::Image(format!("a depth image has at most {PIXELS_MAX} pixels")).of(path));
+    }
     let size = reader.output_buffer_size().filter(|_| kind == (png::ColorType::Grayscale, png::BitDepth::Sixteen));
     let Some(size) = size else {
         return Err(Problem::Image(format!("a depth image is 16-bit grey, not {kind:?}")).of(path));

@@ -66,6 +66,14 @@ impl Recording {
         Ok(Self { folder: folder.into(), manifest, keyframes, truth })
     }
 
+    /// Reads every cloud once, to find a bad one before any use.
+    ///
+    /// # Errors
+    /// [`RecordingError`] for the first.
+    pub fn check_clouds(&self) -> Result<(), RecordingError> {
+        (0..self.len()).try_for_each(|index| self.points(index).map(drop))
+    }
+
     /// Where it lies.
     pub fn folder(&self) -> &Path {
         &self.folder

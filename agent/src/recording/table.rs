@@ -2,6 +2,7 @@
 //! refuses the recording; nothing is guessed or skipped.
 
 use super::error::{Problem, RecordingError, on};
+use crate::observation::COORDINATE_MAX;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::recording::{KEYFRAMES_HEADER, KEYFRAMES_MAX, TRUTH_HEADER};
 use merganser_protocol::time::Stamp;
@@ -129,7 +130,12 @@ pub(super) fn pose_of([x, y, z, qx, qy, qz, qw]: [f64; 7]) -> Result<Se3, Proble
         return Err(Problem::Quaternion(length));
     }
     let rotation = So3::from_xyzw(q).ok_or(Problem::Quaternion(length))?;
-    Ok(Se3::new(rotation, Vector3::new(x, y, z)))
+    near(Se3::new(rotation, Vector3::new(x, y, z)))
+}
+
+/// Refuses a pose too far from the origin.
+pub(super) fn near(pose: Se3) -> Result<Se3, Problem> {
+    if pose.translation.iter().all(|x| x.abs() <= COORDINATE_MAX) { Ok(pose) } else { Err(Problem::Far) }
 }
 
 fn covariance(fields: &[&str]) -> Result<Covariance<6>, Problem> {

@@ -146,6 +146,7 @@ fn bad_tables_are_told_with_their_line() {
     expect(&field(0, 1, "X"), KEYFRAMES, Some(1), "the first line must be");
     expect(&field(2, 1, "NaN"), KEYFRAMES, Some(3), "x is NaN");
     expect(&field(2, 7, "inf"), KEYFRAMES, Some(3), "qw is inf");
+    expect(&field(2, 1, "1e300"), KEYFRAMES, Some(3), "beyond 1e7 m");
     expect(&field(2, 2, "1,5"), KEYFRAMES, Some(3), "31 fields instead of 30");
     expect(&field(2, 2, "one"), KEYFRAMES, Some(3), "y = \"one\" is not a number");
     expect(&field(2, 0, "1.5"), KEYFRAMES, Some(3), "stamp_ns = \"1.5\"");
@@ -161,6 +162,7 @@ fn bad_tables_are_told_with_their_line() {
     let truth = |column, value: &'static str| refused(move |d| set_field(&d.join(TRUTH), 2, column, value));
     expect(&truth(0, "77"), TRUTH, Some(3), "stamp 77 is not 1001");
     expect(&truth(4, "NaN"), TRUTH, Some(3), "qx is NaN");
+    expect(&truth(1, "-1e9"), TRUTH, Some(3), "beyond 1e7 m");
     expect(&refused(|d| fs::write(d.join(KEYFRAMES), "").unwrap()), KEYFRAMES, Some(1), "the first line must be");
     let endless = refused(|d| fs::write(d.join(TRUTH), "x".repeat(1 << 20)).unwrap());
     expect(&endless, TRUTH, Some(1), "longer than 8192 bytes");
@@ -180,6 +182,8 @@ fn bad_clouds_are_told_when_they_are_read() {
     expect(&with(&[]), "000001.bin", None, "empty");
     expect(&with(&[0; 35]), "000001.bin", None, "35 bytes long where 36 are due");
     expect(&with(&f32::NAN.to_le_bytes().repeat(3)), "000001.bin", None, "point 0 ");
+    expect(&with(&1e8f32.to_le_bytes().repeat(3)), "000001.bin", None, "point 0 ");
+    assert_eq!(recording.check_clouds().unwrap_err().path.file_name().unwrap(), "000001.bin");
     expect(&with(&vec![0; 12 * (cloud::POINTS_MAX + 1)]), "000001.bin", None, "POINTS_MAX");
     let file = fs::File::create(&cloud).unwrap();
     file.set_len(cloud::CLOUD_BYTES_MAX + 1).unwrap();
@@ -198,6 +202,12 @@ fn a_folder_of_recordings_needs_two_robots_of_different_names() {
     assert!(open_all(dir.path()).unwrap_err().to_string().contains("is also that of"));
     assert_eq!(detect(dir.path()).unwrap(), Kind::Recordings);
     assert!(detect(&dir.path().join("one")).unwrap_err().to_string().contains("of one robot"));
+    // Nobody is left out in silence.
+    let three = dir.path().join("three");
+    fs::remove_file(three.join(MANIFEST)).unwrap();
+    expect(&open_all(dir.path()).unwrap_err(), MANIFEST, None, "No such file");
+    fs::create_dir(three.join(MANIFEST)).unwrap();
+    assert!(open_all(dir.path()).is_err());
     let empty = tempfile::tempdir().unwrap();
     assert!(detect(empty.path()).unwrap_err().to_string().contains("7-Scenes"));
     assert!(detect(&empty.path().join("nowhere")).unwrap_err().to_string().contains("No such file"));
@@ -230,6 +240,10 @@ fn lidar_scans_of_both_kinds_are_cut_into_robots() {
     fs::write(kitti.path().join("poses.txt"), poses.replace("1 0 0 3", "1 0.5 0 3")).unwrap();
     let error = prepare(kitti.path(), out.path(), 1).unwrap_err();
     assert_eq!(error.line, Some(4), "{error}");
+    let four: Vec<&str> = poses.lines().take(4).collect();
+    fs::write(kitti.path().join("poses.txt"), four.join("\n")).unwrap();
+    let error = prepare(kitti.path(), out.path(), 1).unwrap_err();
+    assert!(error.to_string().contains("scan 000004 has no pose"), "{error}");
 }
 
 /// The folder of data sets, or why there is none.

@@ -248,6 +248,8 @@ pub enum Event {
     Rejected {
         /// From whom, as far as known.
         peer: Option<RobotId>,
+        /// The peer's name in the roster, else its id in hexadecimal; `unknown` where nobody is known.
+        name: String,
         /// What was wrong.
         reason: String,
         /// Refusals of the same peer not reported one by one.

@@ -393,7 +393,8 @@ impl Agent {
     /// Counts a refusal and reports it, at most once per peer and interval.
     fn reject(&mut self, peer: Option<RobotId>, reason: &'static str, detail: &str) {
         if let Some(suppressed) = self.stats.rejected(self.now, peer, reason) {
-            self.event(Event::Rejected { peer, reason: format!("{reason}: {detail}"), suppressed });
+            let name = peer.map_or_else(|| "unknown".to_owned(), |peer| self.robot_name(peer));
+            self.event(Event::Rejected { peer, name, reason: format!("{reason}: {detail}"), suppressed });
         }
     }
 }

@@ -244,7 +244,7 @@ impl Agent {
     }
 
     /// A robot's name, or its id if the roster does not hold it.
-    fn robot_name(&self, robot: RobotId) -> String {
+    pub(super) fn robot_name(&self, robot: RobotId) -> String {
         self.replica.name_of(robot).map_or_else(|| robot.to_string(), ToString::to_string)
     }
 
