@@ -2,6 +2,7 @@
 //! Times are in seconds and sizes in bytes where the name says so. `agent/dist/default.toml` shows every key with its
 //! default.
 
+use crate::link::session::in_words;
 use crate::trust::{PublicKey, SecretKey, TrustError};
 use merganser_protocol::agent::Identity;
 use merganser_protocol::ids::Name;
@@ -355,7 +356,13 @@ impl ZenohConfig {
         for (key, list) in [("zenoh.listen", &self.listen), ("zenoh.connect", &self.connect)] {
             for text in list {
                 if let Err(error) = text.parse::<zenoh::config::EndPoint>() {
+                    let error = in_words(error);
                     let mend = format!("{text:?} is no endpoint ({error}); write e.g. \"tcp/10.0.0.2:7447\"");
+                    return Err(ValueError { key: key.into(), mend });
+                }
+                if !text.starts_with("tcp/") {
+                    let mend =
+                        format!("{text:?} is not TCP, the only transport built in; write e.g. \"tcp/10.0.0.2:7447\"");
                     return Err(ValueError { key: key.into(), mend });
                 }
             }

@@ -164,5 +164,5 @@ impl Shared {
 }
 
 fn refused<E: std::fmt::Display>(key: String) -> impl FnOnce(E) -> LinkError {
-    move |error| LinkError::Declare { key, reason: error.to_string() }
+    move |error| LinkError::Declare { key, reason: session::in_words(error) }
 }

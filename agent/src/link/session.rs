@@ -59,7 +59,7 @@ pub async fn open(config: &ZenohConfig, role: Role) -> Result<Session, LinkError
     let refused = |reason| LinkError::Open { listen: config.listen.clone(), reason };
     let settings = settings(config, role)?;
     match tokio::time::timeout(OPEN_TIMEOUT, zenoh::open(settings)).await {
-        Ok(session) => session.map_err(|error| refused(error.to_string())),
+        Ok(session) => session.map_err(|error| refused(in_words(error))),
         Err(_) => Err(refused(format!("no answer in {} s", OPEN_TIMEOUT.as_secs()))),
     }
 }
@@ -99,10 +99,29 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
         settings.insert_json5(key, &value.to_string()).map_err(|error| LinkError::Setting {
             key,
             value,
-            reason: error.to_string(),
+            reason: in_words(error),
         })?;
     }
     Ok(settings)
+}
+
+/// An error of Zenoh without the places in its sources (` at /…/endpoint.rs:615.`), which help no user.
+pub fn in_words(error: impl std::fmt::Display) -> String {
+    let text = error.to_string();
+    let mut words = String::new();
+    let mut rest = text.as_str();
+    while let Some(at) = rest.find(" at /") {
+        let place = &rest[at + 4..];
+        let end = place.find(|c: char| c.is_whitespace() || c == ')').unwrap_or(place.len());
+        if !place[..end].contains(".rs:") {
+            words.push_str(&rest[..at + 5]);
+            rest = &rest[at + 5..];
+            continue;
+        }
+        words.push_str(&rest[..at]);
+        rest = &place[end..];
+    }
+    words + rest
 }
 
 /// The connect list without ourselves, so that all robots can share one list.
@@ -158,6 +177,12 @@ fn access(interfaces: &[String]) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn places_in_sources_are_left_out_of_errors() {
+        let told = "bad endpoint: x at /home/a b/z.rs at /r/src/endpoint.rs:615.) and at /tmp/file";
+        assert_eq!(in_words(told), "bad endpoint: x at /home/a b/z.rs) and at /tmp/file");
+    }
 
     #[test]
     fn zenoh_takes_all_settings_and_does_not_connect_to_itself() {
