@@ -65,7 +65,8 @@ fn parse(bytes: &[u8], format: CloudFormat) -> Result<Vec<[f32; 3]>, Fault> {
     if points.is_empty() {
         return Err(Problem::CloudEmpty.into());
     }
-    match points.iter().position(|point| point.iter().any(|c| !(f64::from(c.abs()) <= COORDINATE_MAX))) {
+    let near = |c: &f32| f64::from(c.abs()) <= COORDINATE_MAX; // false for NaN
+    match points.iter().position(|point| !point.iter().all(near)) {
         Some(index) => Err(Problem::Point(index).into()),
         None => Ok(points),
     }
