@@ -135,6 +135,40 @@ fn ten_thousand_facts_of_strangers_are_counted_reported_once_and_forgotten() {
 }
 
 #[test]
+fn a_slow_disk_bounds_what_waits_for_it_and_nothing_is_lost() {
+    const MAX: u64 = 1024;
+    let mut agent = agent(0, Restored::default());
+    let key = ed25519_dalek::SigningKey::from_bytes(&common::secret(1));
+    let roster = [(name(1), common::public(1))];
+    let mut theirs = Replica::new(&Name::new("test").unwrap(), roster, &common::config().gossip).unwrap();
+    let verdict = Fact::Verdict(VerdictFact {
+        alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: robot(1), epoch: 1 }, seq: 0 },
+        outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
+    });
+    let facts: Vec<Vec<u8>> = (0..MAX + 10)
+        .map(|_| Message::Facts(vec![EntryBytes(theirs.append(&key, 1, &verdict).unwrap().encode())]).encode())
+        .collect();
+    let mut batches = Vec::new();
+    let mut hear = |agent: &mut merganser_protocol::agent::Agent, bytes: &Vec<u8>| {
+        let input = Input::Received { from: robot(1), channel: Channel::Facts, bytes: bytes.clone() };
+        agent.handle(Instant::ZERO, input);
+        batches.extend(drain(agent).iter().filter_map(|output| match output {
+            Output::Persist { batch, .. } => Some(*batch),
+            _ => None,
+        }));
+        (batches.len() as u64, batches.last().copied().unwrap_or_default())
+    };
+    let waiting = facts.iter().map(|bytes| hear(&mut agent, bytes)).last().unwrap();
+    assert_eq!(waiting.0, MAX);
+    assert_eq!(agent.snapshot(Instant::ZERO).stats.rejected["facts: overload"], 10);
+    // The disk comes back: what was refused comes again.
+    agent.handle(Instant::ZERO, Input::Persisted { up_to: waiting.1 });
+    let (_, last) = facts.iter().rev().take(10).rev().map(|bytes| hear(&mut agent, bytes)).last().unwrap();
+    agent.handle(Instant::ZERO, Input::Persisted { up_to: last });
+    assert_eq!(agent.status().entries, MAX + 10);
+}
+
+#[test]
 fn garbage_is_refused_and_every_question_answered_exactly_once() {
     let mut agent = agent(0, Restored::default());
     let garbage: [&[u8]; 5] = [b"", b"x", &[0xff; 70_000], b"Mg\x63\x01abc", &[0; 64]];

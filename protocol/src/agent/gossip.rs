@@ -16,6 +16,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Raw blobs kept in memory to serve others.
 pub const BLOBS_MAX: usize = 2_048;
+/// Batches on their way to the disk beyond which facts of others are refused for now: a slow disk bounds the memory.
+pub const BATCHES_WAITING_MAX: usize = 1_024;
 /// Shortest time between two wishes ([`Message::AlignRequest`]).
 const WISH_EVERY: Duration = Duration::from_secs(2);
 
@@ -184,6 +186,11 @@ impl Agent {
         self.stats.received(message.kind(), bytes.len());
         match (channel, message) {
             (Channel::Pose, Message::Pose(beacon)) => self.on_beacon(from, &beacon),
+            (Channel::Facts, Message::Facts(_)) if self.ledger.waiting.len() >= BATCHES_WAITING_MAX => {
+                // Nothing is lost: it comes again when the sets are compared.
+                let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk");
+                self.reject(Some(from), "facts: overload", &detail);
+            }
             (Channel::Facts, Message::Facts(entries)) => {
                 for entry in &entries {
                     self.ingest(Some(from), &entry.0);
