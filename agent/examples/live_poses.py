@@ -5,8 +5,8 @@ import json, sys, zenoh
 config = zenoh.Config()
 if len(sys.argv) > 1:
     config.insert_json5("connect/endpoints", json.dumps(sys.argv[1:]))
-with zenoh.open(config) as session:
-    for sample in session.declare_subscriber("merganser/v1/*/*/view/poses"):
+with zenoh.open(config) as session, session.declare_subscriber("merganser/v1/*/*/view/poses") as poses:
+    for sample in poses:
         observer = str(sample.key_expr).split("/")[3]
         for robot in json.loads(sample.payload.to_string())["robots"]:
             if robot["t_own_body"]:
