@@ -124,7 +124,7 @@ impl Default for EstimateConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GossipConfig {
-    /// Time between two `have` announcements.
+    /// Longest time between two announcements of the root hash. They come this rarely only while nothing changes.
     pub have_secs: f64,
     /// Time between two pose beacons.
     pub pose_secs: f64,
@@ -141,7 +141,7 @@ pub struct GossipConfig {
 impl Default for GossipConfig {
     fn default() -> Self {
         Self {
-            have_secs: 1.0,
+            have_secs: 16.0,
             pose_secs: 0.5,
             delta_bytes_max: 64 * 1024,
             answer_secs: 2.0,

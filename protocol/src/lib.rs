@@ -12,13 +12,15 @@
 //! shell says that they are durable. An error is somebody's bad input, counted and reported as an event; a panic is our
 //! bug. `tests/agent_contract.rs` holds the core to all of this.
 //!
-//! Modules point one way: `time, ids, config` ← `geometry` ← `wire` ← `submap, align, estimate, replica` ← `agent`.
+//! Modules point one way: `time, ids, config` ← `geometry` ← `wire` ← `submap, align, estimate, replica` ←
+//! `gossip` ← `agent`.
 
 pub mod agent;
 pub mod align;
 pub mod config;
 pub mod estimate;
 pub mod geometry;
+pub mod gossip;
 pub mod ids;
 pub mod recording;
 pub mod replica;

@@ -290,12 +290,12 @@ impl Agent {
 
     /// Whom to ask for a blob: its owner, or after failures any neighbour in turn (whoever fetched it has it).
     fn holder(&self, fetch: &Fetch) -> Option<crate::ids::RobotId> {
-        let neighbours = &self.gossip.neighbours;
+        let spread = &self.gossip.spread;
         let turn = fetch.failures as usize;
-        if turn.is_multiple_of(2) && neighbours.contains(&fetch.owner) {
+        if turn.is_multiple_of(2) && spread.is_neighbour(fetch.owner) {
             return Some(fetch.owner);
         }
-        neighbours.iter().nth((turn / 2) % neighbours.len().max(1)).copied()
+        spread.neighbours().nth((turn / 2) % spread.neighbours().count().max(1))
     }
 
     pub(super) fn on_aligned(&mut self, job: JobId, outcome: Result<Box<Measured>, RefusalReason>) {
@@ -345,8 +345,7 @@ impl Agent {
 
     /// The most similar pair that the other endpoint should try and that would join frames not yet merged.
     pub(super) fn best_wish(&mut self) -> Option<Pair> {
-        let reachable =
-            |pair: &Pair| [pair.0, pair.1].iter().any(|id| self.gossip.neighbours.contains(&id.frame.robot));
+        let reachable = |pair: &Pair| [pair.0, pair.1].iter().any(|id| self.gossip.spread.is_neighbour(id.frame.robot));
         let best = self
             .negotiation
             .wishes

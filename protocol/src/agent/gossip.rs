@@ -1,18 +1,19 @@
-//! How facts spread (DESIGN §4): new entries are published once; root hashes are announced at intervals; a neighbour
-//! whose root differs is asked for what we lack, by have-vector. Blobs are fetched on demand from whoever may have
-//! them. Pose beacons are hints: best effort, latest wins, never facts.
+//! How the agent talks (DESIGN §4): new entries of ours are published once; [`crate::gossip`] decides what else is said
+//! about facts; blobs are fetched on demand from whoever may have them. Pose beacons are hints: best effort, latest
+//! wins, never facts.
 
 use super::Agent;
 use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
 use super::knowledge::{Pair, pair_of};
+use crate::config::GossipConfig;
+use crate::gossip::{Answer, Spread, Step};
 use crate::ids::{EntryId, Hash, RobotId, SubmapId};
 use crate::time::Instant;
 use crate::wire::limits::BLOB_LEN_MAX;
 use crate::wire::messages::{AlignStatus, Message};
-use crate::wire::{Beacon, BeaconContent, HaveRoot};
+use crate::wire::{Beacon, BeaconContent};
 use core::time::Duration;
-use rand::RngExt;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// Raw blobs kept in memory to serve others.
 pub const BLOBS_MAX: usize = 2_048;
@@ -23,16 +24,13 @@ const WISH_EVERY: Duration = Duration::from_secs(2);
 
 /// What the gossip remembers.
 pub(super) struct Gossip {
-    pub(super) neighbours: BTreeSet<RobotId>,
+    pub(super) spread: Spread,
     beacons: BTreeMap<RobotId, SeenBeacon>,
     blobs: BTreeMap<Hash, Vec<u8>>,
     questions: BTreeMap<QueryId, Question>,
-    syncing: BTreeMap<RobotId, QueryId>,
-    next_have: Instant,
     next_pose: Instant,
     next_wish: Instant,
     beacon_counter: u64,
-    have_tick: u64,
 }
 
 /// The latest beacon of a robot.
@@ -58,18 +56,15 @@ enum About {
 }
 
 impl Gossip {
-    pub(super) fn new(now: Instant) -> Self {
+    pub(super) fn new(me: RobotId, config: &GossipConfig, now: Instant) -> Self {
         Self {
-            neighbours: BTreeSet::new(),
+            spread: Spread::new(me, config.have_secs, config.answer_secs, now),
             beacons: BTreeMap::new(),
             blobs: BTreeMap::new(),
             questions: BTreeMap::new(),
-            syncing: BTreeMap::new(),
-            next_have: now,
             next_pose: now,
             next_wish: now,
             beacon_counter: 0,
-            have_tick: 0,
         }
     }
 
@@ -91,13 +86,12 @@ impl Gossip {
 
 impl Agent {
     pub(super) fn gossip_timeout(&self) -> Option<Instant> {
-        Some(self.gossip.next_have.min(self.gossip.next_pose))
+        Some(self.gossip.spread.timeout().min(self.gossip.next_pose))
     }
 
     pub(super) fn run_timers(&mut self) {
-        if self.now >= self.gossip.next_have {
-            self.announce();
-        }
+        self.expire_questions();
+        self.spread();
         if self.now >= self.gossip.next_pose {
             self.gossip.next_pose = self.now.after(Duration::from_secs_f64(self.config.gossip.pose_secs));
             self.publish_pose();
@@ -106,24 +100,24 @@ impl Agent {
             self.gossip.next_wish = self.now.after(WISH_EVERY);
             self.send_wish();
         }
-        self.expire_questions();
     }
 
-    /// Publishes the root hash; a little jitter keeps a swarm that started together from speaking together.
-    fn announce(&mut self) {
-        let jitter = self.rng.random_range(0.9..1.1);
-        self.gossip.next_have = self.now.after(Duration::from_secs_f64(self.config.gossip.have_secs * jitter));
-        if self.gossip.neighbours.is_empty() {
-            return;
+    /// Does what the gossip about facts wants done now.
+    fn spread(&mut self) {
+        // While received entries wait for the disk our vector is stale: asking now would fetch them twice.
+        let busy = !self.ledger.waiting.is_empty() || !self.ledger.open.is_empty();
+        while let Some(step) = self.gossip.spread.step(self.now, &self.replica, busy, &mut self.rng) {
+            match step {
+                Step::Announce(root) => self.publish(Channel::Have, &Message::Have(root)),
+                Step::Ask { peer, have } => {
+                    self.ask(peer, QueryKind::Sync, &Message::SyncRequest(have), About::Sync);
+                }
+            }
         }
-        self.gossip.have_tick += 1;
-        let (robot, root, count) = (self.me.robot, self.replica.root(), self.replica.count());
-        let root = HaveRoot { robot, root, count, tick: self.gossip.have_tick };
-        self.publish(Channel::Have, &Message::Have(root));
     }
 
     fn publish_pose(&mut self) {
-        if self.gossip.neighbours.is_empty() {
+        if self.is_alone() {
             return;
         }
         let Some((index, t_anchor_body, stamp)) = self.mapper.body() else { return };
@@ -137,9 +131,13 @@ impl Agent {
         }
     }
 
+    fn is_alone(&self) -> bool {
+        self.gossip.spread.neighbours().next().is_none()
+    }
+
     /// Publishes entries of ours that just became durable.
     pub(super) fn publish_entries(&mut self, ids: &[EntryId]) {
-        if self.gossip.neighbours.is_empty() {
+        if self.is_alone() {
             return; // Nobody listens; whoever comes will sync.
         }
         let entries: Vec<Vec<u8>> =
@@ -169,10 +167,7 @@ impl Agent {
         if robot == self.me.robot || self.replica.name_of(robot).is_none() {
             return;
         }
-        if !up {
-            self.gossip.neighbours.remove(&robot);
-        } else if self.gossip.neighbours.insert(robot) {
-            self.gossip.next_have = self.now; // Contact: compare at once.
+        if self.gossip.spread.on_neighbour(self.now, robot, up, &mut self.rng) && up {
             self.negotiation.out_of_reach.clear();
             self.negotiation.stir();
         }
@@ -196,7 +191,9 @@ impl Agent {
                     self.ingest(Some(from), &entry.0);
                 }
             }
-            (Channel::Have, Message::Have(have)) => self.on_have(from, &have),
+            (Channel::Have, Message::Have(have)) => {
+                self.gossip.spread.on_have(self.now, &self.replica, from, have);
+            }
             (_, other) => self.reject(Some(from), "wrong channel", other.kind()),
         }
     }
@@ -216,27 +213,6 @@ impl Agent {
         }
     }
 
-    /// A neighbour holds another set: ask it for what we lack. (It asks us in turn when it hears our root.)
-    fn on_have(&mut self, from: RobotId, have: &HaveRoot) {
-        let peer = have.robot;
-        if peer != from || self.replica.name_of(peer).is_none() {
-            return self.reject(Some(from), "have: wrong sender", "root hash under another robot's key");
-        }
-        if self.replica.differs(have) {
-            self.sync_with(peer);
-        }
-    }
-
-    fn sync_with(&mut self, peer: RobotId) {
-        // While received entries wait for the disk our vector is stale: asking now would fetch them twice.
-        if self.gossip.syncing.contains_key(&peer) || !self.ledger.waiting.is_empty() || !self.ledger.open.is_empty() {
-            return;
-        }
-        let vector = Message::SyncRequest(self.replica.have());
-        let query = self.ask(peer, QueryKind::Sync, &vector, About::Sync);
-        self.gossip.syncing.insert(peer, query);
-    }
-
     pub(super) fn fetch_blob(&mut self, hash: Hash, peer: RobotId) -> QueryId {
         let request = Message::BlobRequest { hash, offset: 0, len: BLOB_LEN_MAX as u32 };
         self.ask(peer, QueryKind::Blob, &request, About::Blob(hash))
@@ -251,9 +227,7 @@ impl Agent {
 
     pub(super) fn on_answered(&mut self, query: QueryId, bytes: Option<&[u8]>) {
         let Some(question) = self.gossip.questions.remove(&query) else { return };
-        if matches!(question.about, About::Sync) {
-            self.gossip.syncing.remove(&question.peer);
-        }
+        let refused = bytes.is_some_and(<[u8]>::is_empty);
         let answer = match bytes.filter(|bytes| !bytes.is_empty()).map(Message::decode) {
             None => None,
             Some(Ok(message)) => Some(message),
@@ -267,19 +241,26 @@ impl Agent {
         }
         match (question.about, answer) {
             (About::Sync, Some(Message::SyncReply(delta))) => {
+                let mut new = 0;
                 for entry in &delta.entries {
-                    self.ingest(Some(question.peer), &entry.0);
+                    new += usize::from(self.ingest(Some(question.peer), &entry.0));
                 }
                 for proof in &delta.forks {
-                    self.ingest_fork(question.peer, proof);
+                    new += usize::from(self.ingest_fork(question.peer, proof));
                 }
+                self.synced(question.peer, Answer::Got { new, more: delta.more });
             }
+            (About::Sync, _) => self.synced(question.peer, if refused { Answer::Refused } else { Answer::Failed }),
             (About::Blob(hash), Some(Message::BlobReply { hash: got, bytes, .. })) if got == hash => {
                 self.on_blob(query, question.peer, hash, bytes);
             }
             (About::Blob(_), _) => self.negotiation.fetch_failed(query, self.now),
-            (About::Sync | About::Align, _) => {}
+            (About::Align, _) => {}
         }
+    }
+
+    fn synced(&mut self, peer: RobotId, answer: Answer) {
+        self.gossip.spread.on_answer(self.now, &self.replica, peer, answer);
     }
 
     fn on_blob(&mut self, query: QueryId, peer: RobotId, hash: Hash, bytes: Vec<u8>) {
@@ -318,6 +299,8 @@ impl Agent {
     fn answer(&mut self, kind: QueryKind, question: Message) -> Option<Message> {
         match (kind, question) {
             (QueryKind::Sync, Message::SyncRequest(have)) => {
+                let have = self.replica.read_have(&have)?;
+                self.gossip.spread.on_asked(self.now, &self.replica, &have);
                 Some(Message::SyncReply(self.replica.delta_for(&have, self.config.gossip.delta_bytes_max)))
             }
             (QueryKind::Blob, Message::BlobRequest { hash, offset, len }) => {

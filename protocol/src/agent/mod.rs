@@ -140,7 +140,7 @@ impl Agent {
         let frame = FrameId { robot, epoch: restored.fresh_epoch };
         let mut agent = Self {
             mapper: Mapper::new(&config.submap),
-            gossip: Gossip::new(now),
+            gossip: Gossip::new(robot, &config.gossip, now),
             me: Me { robot, frame, key, name: identity.name, swarm: identity.swarm },
             rng: ChaCha8Rng::seed_from_u64(seed),
             config,
@@ -255,8 +255,8 @@ impl Agent {
         }
     }
 
-    /// Takes an entry from a peer; it takes effect once it is durable.
-    fn ingest(&mut self, from: Option<RobotId>, bytes: &[u8]) {
+    /// Takes an entry from a peer; it takes effect once it is durable. Whether it changed anything.
+    fn ingest(&mut self, from: Option<RobotId>, bytes: &[u8]) -> bool {
         match self.replica.ingest(bytes) {
             Ok(Ingested::New(ids)) => {
                 for id in ids {
@@ -264,26 +264,33 @@ impl Agent {
                     self.ledger.open.push(Record::Entry { id, bytes: bytes.to_vec() });
                     self.meet_own_past(id);
                 }
+                return true;
             }
             Ok(Ingested::Known | Ingested::Early(_)) => {}
             Err(error @ IngestError::Fork(frame)) => {
                 self.reject(Some(frame.robot), error.reason(), &error.to_string());
+                self.gossip.spread.on_news(self.now, 1);
                 self.relearn();
+                return true;
             }
             Err(error) => self.reject(from, error.reason(), &error.to_string()),
         }
+        false
     }
 
-    /// Takes the proof that a log has two histories.
-    fn ingest_fork(&mut self, from: RobotId, [a, b]: &[EntryBytes; 2]) {
+    /// Takes the proof that a log has two histories. Whether it was news.
+    fn ingest_fork(&mut self, from: RobotId, [a, b]: &[EntryBytes; 2]) -> bool {
         match self.replica.ingest_fork(&a.0, &b.0) {
             Ok((frame, true)) => {
                 self.reject(Some(frame.robot), "fork", &format!("log {frame} has two histories; it is quarantined"));
+                self.gossip.spread.on_news(self.now, 1);
                 self.relearn();
+                return true;
             }
             Ok((_, false)) => {}
             Err(error) => self.reject(Some(from), error.reason(), &error.to_string()),
         }
+        false
     }
 
     /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide.
@@ -319,7 +326,9 @@ impl Agent {
         let later = self.ledger.waiting.split_off(&up_to.saturating_add(1));
         let durable = core::mem::replace(&mut self.ledger.waiting, later);
         let mut own = Vec::new();
-        for id in durable.into_values().flatten() {
+        let durable: Vec<EntryId> = durable.into_values().flatten().collect();
+        self.gossip.spread.on_news(self.now, durable.len());
+        for id in durable {
             self.replica.mark_durable(id);
             self.learn(id);
             if id.frame.robot == self.me.robot {

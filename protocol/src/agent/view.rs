@@ -35,7 +35,7 @@ impl Agent {
             robot: self.me.name.to_string(),
             id: self.me.robot.to_string(),
             epoch: self.me.frame.epoch,
-            neighbours: self.gossip.neighbours.iter().map(|robot| self.robot_name(*robot)).collect(),
+            neighbours: self.gossip.spread.neighbours().map(|robot| self.robot_name(robot)).collect(),
             entries: self.replica.count(),
             digest: self.replica.digest().to_string(),
             submaps: self.negotiation.own().count() as u64,

@@ -2,17 +2,18 @@
 //! asker's vector, so that under any budget every log advances; the answer lists entries in canonical order and can be
 //! resumed by asking again with the vector that includes it.
 
+use super::have::Have;
 use super::set::{Replica, Slot};
 use crate::ids::FrameId;
 use crate::wire::limits::{ENTRIES_PER_DELTA_MAX, FORKS_PER_DELTA_MAX};
 use crate::wire::messages::carried_len;
-use crate::wire::{Delta, EntryBytes, HaveVector, Head};
+use crate::wire::{Delta, EntryBytes, Head};
 use core::ops::Range;
 
 impl Replica {
     /// Entries and fork proofs that the holder of `have` lacks, at most `byte_budget` bytes of them. Progress is
     /// certain from a budget of 4,096 bytes on.
-    pub fn delta_for(&self, have: &HaveVector, byte_budget: usize) -> Delta {
+    pub fn delta_for(&self, have: &Have, byte_budget: usize) -> Delta {
         let mut delta = Delta::default();
         let mut left = byte_budget;
         self.add_forks(have, &mut delta, &mut left);
@@ -28,7 +29,7 @@ impl Replica {
         delta
     }
 
-    fn add_forks(&self, have: &HaveVector, delta: &mut Delta, left: &mut usize) {
+    fn add_forks(&self, have: &Have, delta: &mut Delta, left: &mut usize) {
         let half = *left / 2;
         for (frame, proof) in self.forks() {
             if !have.covers(frame) || have.head(frame) == Some(Head::Forked) {
@@ -47,17 +48,17 @@ impl Replica {
     }
 
     /// Places that the asker lacks, by log.
-    fn lacking(&self, have: &HaveVector) -> Vec<(FrameId, Range<u32>)> {
+    fn lacking(&self, have: &Have) -> Vec<(FrameId, Range<u32>)> {
         let range = |(frame, slot): (&FrameId, &Slot)| {
             let Slot::Log(log) = slot else { return None };
             let range = match have.head(*frame) {
-                None => 0..log.durable,
+                None | Some(Head::Log { len: 0, .. }) => 0..log.durable,
                 Some(Head::Forked) => return None,
-                Some(Head::Log { len, tag }) => match log.durable_entries().get(len as usize - 1) {
-                    None => return None,
+                Some(Head::Log { len, tag }) => match (log.durable_entries().get(len as usize - 1), tag) {
+                    (None, _) => return None,
                     // Another history: our entry in that place is the asker's proof.
-                    Some(held) if Head::tag_of(&held.hash) != tag => len - 1..len,
-                    Some(_) => len..log.durable,
+                    (Some(held), Some(tag)) if Head::tag_of(&held.hash) != tag => len - 1..len,
+                    (Some(_), _) => len..log.durable,
                 },
             };
             (have.covers(*frame) && !range.is_empty()).then_some((*frame, range))
@@ -93,13 +94,12 @@ impl Replica {
 }
 
 /// Whose turn it is first: changes with the vector, so that no log is always last.
-fn first_turn(have: &HaveVector, lacking: usize) -> usize {
+fn first_turn(have: &Have, lacking: usize) -> usize {
     let mut hasher = blake3::Hasher::new();
-    for (frame, head) in &have.heads {
+    for (frame, head) in have.heads() {
         hasher.update(&frame.robot.0);
-        if let Head::Log { len, tag } = head {
+        if let Head::Log { len, .. } = head {
             hasher.update(&len.to_le_bytes());
-            hasher.update(tag);
         }
     }
     let mut bytes = [0; 8];

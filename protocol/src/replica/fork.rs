@@ -53,6 +53,7 @@ impl Replica {
     pub(super) fn quarantine(&mut self, frame: FrameId, a: &[u8], b: &[u8]) {
         let proof = ForkProof { a: a.to_vec(), b: b.to_vec() };
         self.slots.insert(frame, Slot::Forked(proof));
+        self.digest.take();
     }
 }
 

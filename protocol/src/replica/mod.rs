@@ -16,10 +16,11 @@ mod log;
 mod restore;
 mod set;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
 
 pub use fork::ForkProof;
+pub use have::{Have, VectorForm};
 pub use restore::{Damage, RestoreError};
-pub use set::{AppendError, EARLY_PER_ROBOT_MAX, IngestError, Ingested, Replica, RosterError};
+pub use set::{AppendError, EARLY_PER_ROBOT_MAX, IngestError, Ingested, MEMBERS_MAX, Replica, RosterError};

@@ -93,6 +93,7 @@ impl Replica {
         let log = self.log_mut(frame);
         log.entries.truncate(len);
         (0..len as u32).for_each(|seq| log.mark_durable(seq));
+        self.digest.take();
         if len == 0 {
             self.slots.remove(&frame);
         }

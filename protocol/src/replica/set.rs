@@ -7,6 +7,7 @@ use super::log::{Held, Link, Log};
 use crate::config::GossipConfig;
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
 use crate::wire::{Beacon, Entry, EntryContent, EntryError, Fact, FactError, SwarmTag};
+use core::cell::OnceCell;
 use ed25519_dalek::{SigningKey, VerifyingKey};
 use std::collections::BTreeMap;
 use thiserror::Error;
@@ -14,11 +15,18 @@ use thiserror::Error;
 /// Entries per robot that wait for a predecessor, over all its frames.
 pub const EARLY_PER_ROBOT_MAX: usize = 64;
 
+/// Robots in a roster at most: have-vectors count them in two bytes.
+pub const MEMBERS_MAX: usize = 1 << 16;
+
 /// The facts that one robot holds. See the [module](super) for its rules.
 pub struct Replica {
     pub(super) swarm: SwarmTag,
     members: BTreeMap<RobotId, Member>,
     pub(super) slots: BTreeMap<FrameId, Slot>,
+    /// First bytes of the hash of all members' ids: equal rosters, equal places in have-vectors.
+    pub(super) roster_hash: [u8; 4],
+    /// The digest, until the set changes.
+    pub(super) digest: OnceCell<Hash>,
     entries_per_frame_max: u32,
     epochs_per_robot_max: usize,
 }
@@ -43,6 +51,9 @@ pub enum RosterError {
     /// Two names, one key.
     #[error("{0} and {1} have the same key; every robot needs its own")]
     Twice(Name, Name),
+    /// More robots than a have-vector can count.
+    #[error("the roster has {0} robots; at most {MEMBERS_MAX} can form a swarm")]
+    TooMany(usize),
 }
 
 /// What became of an entry that was taken in.
@@ -140,7 +151,7 @@ impl Replica {
     /// An empty replica for the members of `roster` (name and ed25519 public key).
     ///
     /// # Errors
-    /// [`RosterError`] if a key is unusable or used twice.
+    /// [`RosterError`] if a key is unusable or used twice, or there are too many.
     pub fn new(
         swarm: &Name,
         roster: impl IntoIterator<Item = (Name, [u8; 32])>,
@@ -154,9 +165,19 @@ impl Replica {
                 return Err(RosterError::Twice(other.name, name));
             }
         }
+        if members.len() > MEMBERS_MAX {
+            return Err(RosterError::TooMany(members.len()));
+        }
+        let mut ids = blake3::Hasher::new();
+        for robot in members.keys() {
+            ids.update(&robot.0);
+        }
+        let [a, b, c, d, ..] = *ids.finalize().as_bytes();
         Ok(Self {
             swarm: SwarmTag::of(swarm),
             members,
+            roster_hash: [a, b, c, d],
+            digest: OnceCell::new(),
             slots: BTreeMap::new(),
             entries_per_frame_max: limits.entries_per_frame_max,
             epochs_per_robot_max: limits.epochs_per_robot_max,
@@ -239,6 +260,7 @@ impl Replica {
     pub fn mark_durable(&mut self, id: EntryId) {
         if let Some(Slot::Log(log)) = self.slots.get_mut(&id.frame) {
             log.mark_durable(id.seq);
+            self.digest.take();
         }
     }
 

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::config::GossipConfig;
-use crate::ids::{EntryId, FrameId, Hash};
+use crate::ids::{EntryId, FrameId, Hash, RobotId};
 use crate::wire::fact::ScaleKind;
 use crate::wire::samples::{self, key};
 use crate::wire::{Entry, EntryContent, Fact, HaveVector, SwarmTag};
@@ -63,12 +63,12 @@ pub fn feed<'a>(replica: &mut Replica, entries: impl IntoIterator<Item = &'a Vec
 
 /// What two replicas must have in common to be called equal.
 pub fn view(replica: &Replica) -> (Hash, [u8; 8], HaveVector, u64) {
-    (replica.digest(), replica.root(), replica.have(), replica.count())
+    (replica.digest(), replica.root(), replica.have(asker(), TAGGED), replica.count())
 }
 
 /// One exchange: `to` asks `from`. Returns the bytes of entries and proofs that came.
 pub fn pull(to: &mut Replica, from: &Replica, budget: usize) -> usize {
-    let delta = from.delta_for(&to.have(), budget);
+    let delta = from.delta_for(&have_of(from, to), budget);
     let mut bytes = 0;
     for [a, b] in &delta.forks {
         bytes += a.0.len() + b.0.len();
@@ -85,4 +85,17 @@ pub fn pull(to: &mut Replica, from: &Replica, budget: usize) -> usize {
 
 pub fn frame(n: u8, epoch: u32) -> FrameId {
     samples::frame(n, epoch)
+}
+
+/// A vector with hashes.
+pub const TAGGED: VectorForm = VectorForm { tagged: true, listed: false, after: None };
+
+/// Some member.
+pub fn asker() -> RobotId {
+    frame(0, 0).robot
+}
+
+/// What `of` holds, as `reader` understands it.
+pub fn have_of(reader: &Replica, of: &Replica) -> Have {
+    reader.read_have(&of.have(asker(), TAGGED)).unwrap()
 }

@@ -6,7 +6,7 @@ use super::*;
 use crate::config::GossipConfig;
 use crate::ids::{EntryId, Hash, Name};
 use crate::wire::samples::{key, robot};
-use crate::wire::{Entry, EntryContent, EntryError, Fact, HaveVector, Head, SwarmTag};
+use crate::wire::{Entry, EntryContent, EntryError, Fact, Head, SwarmTag};
 use proptest::prelude::*;
 
 fn id(n: u8, epoch: u32, seq: u32) -> EntryId {
@@ -24,7 +24,11 @@ fn own_facts_are_chained_and_shown_only_once_durable() {
 
     let empty = view(&testing::replica());
     let shown = |replica: &Replica| {
-        (replica.count(), replica.facts().count(), replica.delta_for(&HaveVector::default(), 65_536).entries.len())
+        (
+            replica.count(),
+            replica.facts().count(),
+            replica.delta_for(&have_of(&replica, &testing::replica()), 65_536).entries.len(),
+        )
     };
     assert_eq!((view(&replica), shown(&replica)), (empty.clone(), (0, 0, 0)));
     // Out of order: the second is durable, but not all before it.
@@ -33,7 +37,7 @@ fn own_facts_are_chained_and_shown_only_once_durable() {
     replica.mark_durable(first.id());
     assert_eq!(shown(&replica), (2, 2, 2));
     let (_, tag) = (second.id(), Head::tag_of(&second.hash()));
-    assert_eq!(replica.have().heads, [(frame(0, 5), Head::Log { len: 2, tag })]);
+    assert_eq!(have_of(&replica, &replica).head(frame(0, 5)), Some(Head::Log { len: 2, tag: Some(tag) }));
     let facts: Vec<_> = replica.facts().map(|(id, fact)| (id.seq, fact)).collect();
     assert_eq!(facts, [(0, first.fact().unwrap()), (1, second.fact().unwrap())]);
 }
@@ -160,7 +164,7 @@ fn a_second_story_quarantines_the_log_however_it_shows() {
         assert_eq!(replica.ingest(other), Err(IngestError::Fork(frame(1, 0))));
         assert_eq!(replica.ingest(&x[0]), Err(IngestError::Quarantined(frame(1, 0))));
         assert!(replica.facts().all(|(id, _)| id.frame == frame(2, 0)));
-        assert_eq!(replica.have().head(frame(1, 0)), Some(Head::Forked));
+        assert_eq!(have_of(&replica, &replica).head(frame(1, 0)), Some(Head::Forked));
 
         // The proof convinces another robot that held nothing, or either story.
         let (_, proof) = replica.forks().next().unwrap();
@@ -255,7 +259,7 @@ fn deltas_keep_their_budget_and_say_when_they_were_cut() {
     for n in 0..4 {
         feed(&mut full, &chain(n, 0, 6, 0));
     }
-    let nothing = HaveVector::default();
+    let nothing = have_of(&full, &replica());
     let all = full.delta_for(&nothing, 65_536);
     assert!(!all.more && all.entries.len() == 24);
     let total: usize = all.entries.iter().map(|entry| entry.0.len() + 2).sum();
@@ -269,7 +273,7 @@ fn deltas_keep_their_budget_and_say_when_they_were_cut() {
     assert!(small.entries.is_sorted_by_key(|entry| Entry::decode(&entry.0).unwrap().id()), "canonical order");
     let none = full.delta_for(&nothing, 0);
     assert!(none.more && none.entries.is_empty());
-    assert!(!full.delta_for(&full.have(), 65_536).more);
+    assert!(!full.delta_for(&have_of(&full, &full), 65_536).more);
 }
 
 #[test]
@@ -293,20 +297,22 @@ fn vectors_beyond_one_message_go_in_windows() {
     let (mut full, mut empty) = (replica_with(&limits), replica_with(&limits));
     let entries: Vec<_> = (0..2100).flat_map(|epoch| chain(1, epoch, 1, 0)).collect();
     feed(&mut full, &entries);
-    let first = full.have();
+    let window = |of: &Replica, after| of.have(asker(), VectorForm { after, ..TAGGED });
+    let first = window(&full, None);
     assert_eq!(first.heads.len(), crate::wire::limits::HEADS_MAX);
-    let second = full.have_after(first.until);
+    let second = window(&full, first.until);
     assert_eq!(first.heads.len() + second.heads.len(), 2100);
     assert_eq!((second.after, second.until), (first.until, None));
     // A window asks only about itself.
-    assert!(full.delta_for(&first, 65_536).entries.is_empty());
-    assert!(full.delta_for(&second, 65_536).entries.is_empty());
+    for part in [&first, &second] {
+        assert!(full.delta_for(&full.read_have(part).unwrap(), 65_536).entries.is_empty());
+    }
     let mut rounds = 0;
     while view(&empty) != view(&full) {
         let mut after = None;
         loop {
-            let have = empty.have_after(after);
-            let delta = full.delta_for(&have, 65_536);
+            let have = window(&empty, after);
+            let delta = full.delta_for(&full.read_have(&have).unwrap(), 65_536);
             feed(&mut empty, &delta.entries.iter().map(|entry| entry.0.clone()).collect::<Vec<_>>());
             after = have.until;
             if after.is_none() {

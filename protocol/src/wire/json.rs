@@ -3,7 +3,7 @@
 use super::beacon::Beacon;
 use super::entry::Entry;
 use super::fact::{Fact, VerdictOutcome};
-use super::have::{HaveVector, Head};
+use super::have::{HaveVector, Head, Members};
 use crate::geometry::{PoseWithCovariance, Relative, Sim3};
 use crate::ids::{Hash, RobotId};
 use core::fmt::Display;
@@ -38,12 +38,23 @@ pub(super) fn beacon<S: Serializer>(beacon: &Beacon, s: S) -> Result<S::Ok, S::E
 }
 
 pub(super) fn have<S: Serializer>(have: &HaveVector, s: S) -> Result<S::Ok, S::Error> {
+    let hex = |bytes: [u8; 4]| format!("{:08x}", u32::from_be_bytes(bytes));
+    let robot = |place: u16| match &have.members {
+        Members::Listed(robots) => robots.get(usize::from(place)).map(ToString::to_string),
+        Members::Roster(_) => None,
+    };
+    let robot = |place: u16| robot(place).unwrap_or_else(|| format!("#{place}"));
     let head = |head: &Head| match head {
-        Head::Log { len, tag } => json!({ "len": len, "tag": format!("{:08x}", u32::from_be_bytes(*tag)) }),
+        Head::Log { len, tag: Some(tag) } => json!({ "len": len, "tag": hex(*tag) }),
+        Head::Log { len, tag: None } => json!({ "len": len }),
         Head::Forked => json!("forked"),
     };
-    let heads: serde_json::Map<_, _> = have.heads.iter().map(|(frame, h)| (frame.to_string(), head(h))).collect();
+    let heads: serde_json::Map<_, _> =
+        have.heads.iter().map(|(place, epoch, h)| (format!("{}/{epoch}", robot(*place)), head(h))).collect();
     json!({
+        "roster": match &have.members { Members::Roster(hash) => json!(hex(*hash)), Members::Listed(_) => json!("listed") },
+        "asker": robot(have.asker),
+        "named": have.named,
         "after": have.after.map(|frame| frame.to_string()),
         "until": have.until.map(|frame| frame.to_string()),
         "heads": heads,

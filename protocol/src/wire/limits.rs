@@ -31,6 +31,8 @@ pub const BLOB_PIECE_LEN: usize = 16 * 1024;
 pub const ENTRIES_PER_DELTA_MAX: usize = 1024;
 /// Heads in one have-vector at most; a longer vector is sent in windows.
 pub const HEADS_MAX: usize = 2048;
+/// Robots listed in one have-vector at most: one for each head, and the asker.
+pub const MEMBERS_MAX: usize = HEADS_MAX + 1;
 /// Fork proofs in one answer at most.
 pub const FORKS_PER_DELTA_MAX: usize = 8;
 

@@ -24,6 +24,6 @@ pub use beacon::{Beacon, BeaconContent};
 pub use entry::{Entry, EntryBytes, EntryContent, EntryError, SwarmTag};
 pub use fact::Fact;
 pub use frame::WireError;
-pub use have::{HaveRoot, HaveVector, Head};
+pub use have::{HaveRoot, HaveVector, Head, Members};
 pub use messages::{AlignStatus, Delta, Message};
 pub use payload::FactError;

@@ -118,14 +118,24 @@ samples! {
         Message::Pose(_) => { "pose" => Message::Pose(beacon()) }
         Message::Facts(_) => { "facts" => Message::Facts(entries(3)) }
         Message::Have(_) => {
-            "have" => Message::Have(HaveRoot { robot: robot(0), root: *b"rootroot", count: 360, tick: 12 })
+            "have" => Message::Have(HaveRoot { root: *b"rootroot", count: 360 })
         }
         Message::SyncRequest(_) => {
-            "sync_request" => Message::SyncRequest(have()),
+            "sync_request" => Message::SyncRequest(have(|_| None)),
+            "sync_request_tagged" => Message::SyncRequest(have(|k| Some([k, 2, 3, 4]))),
+            "sync_request_named" => Message::SyncRequest(HaveVector {
+                members: Members::Listed((0..3).map(listed).collect()),
+                asker: 2,
+                named: true,
+                after: None,
+                until: None,
+                heads: vec![(0, 5, Head::Log { len: 0, tag: None }), (1, 4, Head::Forked)],
+            }),
             "sync_request_window" => Message::SyncRequest(HaveVector {
                 after: Some(frame(2, 0)),
                 until: Some(FrameId { robot: RobotId([255; 8]), epoch: 1 }),
                 heads: Vec::new(),
+                ..have(|_| None)
             }),
         }
         Message::SyncReply(_) => {
@@ -185,14 +195,20 @@ pub fn beacon() -> Beacon {
     Beacon::sign(&key(0), SwarmTag::of(&swarm()), &content).unwrap()
 }
 
-pub fn have() -> HaveVector {
-    let mut heads = vec![
-        (frame(0, 1), Head::Log { len: 1, tag: [1, 2, 3, 4] }),
-        (frame(0, 203_000_000), Head::Log { len: 300, tag: [5, 6, 7, 8] }),
-        (frame(1, 203_000_000), Head::Forked),
+/// A vector by the roster; `tag` gives the n-th log's.
+pub fn have(tag: impl Fn(u8) -> Option<[u8; 4]>) -> HaveVector {
+    let heads = vec![
+        (0, 1, Head::Log { len: 1, tag: tag(0) }),
+        (0, 203_000_000, Head::Log { len: 300, tag: tag(1) }),
+        (2, 202_999_990, Head::Forked),
+        (700, 203_000_100, Head::Log { len: 17, tag: tag(2) }),
     ];
-    heads.sort_by_key(|(frame, _)| *frame);
-    HaveVector { after: None, until: None, heads }
+    HaveVector { members: Members::Roster([9, 8, 7, 6]), asker: 2, named: false, after: None, until: None, heads }
+}
+
+/// Robots with rising ids.
+pub fn listed(n: u8) -> RobotId {
+    RobotId([n, 7, 7, 7, 7, 7, 7, 7])
 }
 
 pub fn submap_fact(scale: ScaleKind) -> Fact {

@@ -145,24 +145,41 @@ fn every_kind_has_a_limit_that_is_checked_on_both_sides() {
     assert!(one(ENTRY_LEN_MAX).is_ok());
     assert!(one(ENTRY_LEN_MAX + 1).is_err());
     let heads = |n: u32| {
-        let head = |epoch| (samples::frame(0, epoch), Head::Log { len: 1, tag: [0; 4] });
-        let have = HaveVector { heads: (0..n).map(head).collect(), ..HaveVector::default() };
+        let head = |epoch| (0, epoch, Head::Log { len: 1, tag: None });
+        let have = HaveVector { heads: (0..n).map(head).collect(), ..samples::have(|_| None) };
         Message::decode(&Message::SyncRequest(have).encode())
     };
     assert!(heads(HEADS_MAX as u32).is_ok());
     assert!(heads(HEADS_MAX as u32 + 1).is_err());
+    let listed = |n: u16| {
+        let robot = |k: u16| crate::ids::RobotId((u64::from(k)).to_be_bytes());
+        let members = Members::Listed((0..n).map(robot).collect());
+        let have = HaveVector { members, asker: 0, heads: Vec::new(), ..samples::have(|_| None) };
+        Message::decode(&Message::SyncRequest(have).encode())
+    };
+    assert!(listed(MEMBERS_MAX as u16).is_ok());
+    assert!(listed(MEMBERS_MAX as u16 + 1).is_err());
 }
 
 #[test]
 fn the_largest_contents_fit_their_frames() {
     let far = crate::ids::FrameId { robot: crate::ids::RobotId([255; 8]), epoch: u32::MAX };
+    // Epochs that jump up and down make the longest steps.
+    let robot = |k: usize| crate::ids::RobotId((u64::MAX - (MEMBERS_MAX - k) as u64).to_be_bytes());
     let head = |k: usize| {
-        let frame = crate::ids::FrameId { epoch: u32::MAX - (HEADS_MAX - k) as u32, ..far };
-        (frame, Head::Log { len: u32::MAX, tag: [255; 4] })
+        (k as u16, if k.is_multiple_of(2) { u32::MAX } else { 0 }, Head::Log { len: u32::MAX, tag: Some([255; 4]) })
     };
-    let have = HaveVector { after: None, until: Some(far), heads: (0..HEADS_MAX).map(head).collect() };
-    assert!(Message::decode(&Message::SyncRequest(have).encode()).is_ok());
-    let root = HaveRoot { robot: far.robot, root: [255; 8], count: u64::MAX, tick: u64::MAX };
+    let have = HaveVector {
+        members: Members::Listed((0..MEMBERS_MAX).map(robot).collect()),
+        asker: HEADS_MAX as u16,
+        named: true,
+        after: Some(far),
+        until: Some(far),
+        heads: (0..HEADS_MAX).map(head).collect(),
+    };
+    let bytes = Message::SyncRequest(have).encode();
+    assert!(Message::decode(&bytes).is_ok(), "{} bytes", bytes.len());
+    let root = HaveRoot { root: [255; 8], count: u64::MAX };
     assert!(Message::decode(&Message::Have(root).encode()).is_ok());
     let content = BeaconContent {
         anchor: crate::ids::SubmapId {
@@ -192,10 +209,10 @@ fn the_largest_contents_fit_their_frames() {
 
 #[test]
 fn other_encodings_of_the_same_content_are_refused() {
-    // tick = 12 as a two-byte varint.
+    // count = 360 as a three-byte varint.
     let mut bytes = samples::messages().into_iter().find(|(name, _)| *name == "have").unwrap().1.encode();
-    assert_eq!(bytes.pop(), Some(12));
-    bytes.extend([12 | 128, 0]);
+    assert_eq!(bytes.pop(), Some(2));
+    bytes.extend([2 | 128, 0]);
     assert_eq!(Message::decode(&bytes), Err(WireError::NonCanonical { kind: FrameKind::Have }));
 
     // seq = 3, the byte before the kind and the floor, likewise; even if its origin signs that encoding.
@@ -218,18 +235,40 @@ fn other_encodings_of_the_same_content_are_refused() {
 }
 
 #[test]
-fn heads_must_rise_and_lie_in_their_range() {
+fn heads_must_rise_and_have_robots_and_all_their_tags() {
     let decode = |change: &dyn Fn(&mut HaveVector)| {
-        let mut have = samples::have();
+        let mut have = samples::have(|k| Some([k; 4]));
         change(&mut have);
         Message::decode(&Message::SyncRequest(have).encode()).map(|_| ()).map_err(|e| e.reason())
     };
+    let listed = |n: u8| Members::Listed((0..n).map(samples::listed).collect());
+    let log = |len, tag| Head::Log { len, tag };
     assert_eq!(decode(&|_| {}), Ok(()));
     assert_eq!(decode(&|have| have.heads.reverse()), Err("value"));
     assert_eq!(decode(&|have| have.heads.push(*have.heads.last().unwrap())), Err("value"));
-    assert_eq!(decode(&|have| have.after = Some(have.heads[0].0)), Err("value"));
-    assert_eq!(decode(&|have| have.until = Some(have.heads[0].0)), Err("value"));
-    assert_eq!(decode(&|have| have.until = have.heads.last().map(|(frame, _)| *frame)), Ok(()));
+    assert_eq!(decode(&|have| have.heads[1].1 = 0), Err("value"), "falling epoch");
+    assert_eq!(decode(&|have| have.members = listed(3)), Err("value"), "place 700 of 3");
+    assert_eq!(decode(&|have| have.heads.truncate(3)), Ok(()));
+    let short = |have: &mut HaveVector, members| {
+        have.heads.truncate(3);
+        have.members = members;
+    };
+    assert_eq!(decode(&|have| short(have, listed(3))), Ok(()));
+    assert_eq!(decode(&|have| short(have, listed(2))), Err("value"), "place 2 and asker 2 of 2");
+    let fourth = |have: &mut HaveVector| {
+        short(have, listed(3));
+        have.asker = 3;
+    };
+    assert_eq!(decode(&fourth), Err("value"), "asker 3 of 3");
+    let unsorted = Members::Listed((0..3).rev().map(samples::listed).collect());
+    assert_eq!(decode(&|have| short(have, unsorted.clone())), Err("value"));
+    assert_eq!(decode(&|have| have.heads[0].2 = log(1, None)), Err("value"), "a tag is missing");
+    assert_eq!(decode(&|have| have.heads[0].2 = log(0, Some([0; 4]))), Err("value"), "nothing held, but not named");
+    let named = |have: &mut HaveVector| {
+        have.named = true;
+        have.heads[0].2 = log(0, Some([0; 4]));
+    };
+    assert_eq!(decode(&named), Ok(()));
 }
 
 #[test]

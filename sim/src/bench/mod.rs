@@ -3,6 +3,7 @@
 pub mod corr;
 pub mod cpu;
 pub mod frames;
+pub mod gossip;
 pub mod outliers;
 pub mod peer;
 pub mod peers;
@@ -24,6 +25,11 @@ pub enum Bench {
     /// work on the machine counts little; ratios are the peer's time over ours. Exit code 1 if a wrong answer was
     /// accepted, 2 if a file or option cannot be used.
     Registration(registration::Registration),
+    /// Gossip of facts in large swarms: time until all hold the same, and bytes, beside a plain gossip
+    ///
+    /// Robots hold real replicas of signed facts; radio, motion and time are simulated. Exit code 1 if a swarm did not
+    /// converge in the time its case allows.
+    Gossip(gossip::Gossip),
     /// Frame-level consensus on seeded worlds: success, refusals and honesty of the covariance
     ///
     /// Two robots drive a figure-eight of about 120 m with drifting odometry; a cell has 20 alignments between them, of
@@ -45,6 +51,7 @@ pub enum Bench {
 pub fn run(bench: Bench) -> anyhow::Result<bool> {
     match bench {
         Bench::Registration(options) => registration::run(&options),
+        Bench::Gossip(options) => gossip::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }
 }

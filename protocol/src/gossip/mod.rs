@@ -1,0 +1,208 @@
+//! How sets of facts become equal, at the lowest cost known (DESIGN §4): who announces when, who asks whom, and for what.
+//! Pure decisions over a [`Replica`]; the agent carries them out, and the simulator measures them by the thousand.
+//!
+//! - **Announce** the root hash: 18 bytes or so. While nothing changes, the pauses double and a robot that has heard
+//!   enough equal roots stays silent (Trickle, RFC 6206). News are announced the sooner the more of them there are.
+//! - **Pull**: a neighbour with another root is asked for what we lack, by have-vector; one question at a time, to the
+//!   neighbour that promises most, so that nothing is fetched twice. Small gains wait for more, large ones do not.
+//! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
+//! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
+//!   pause that doubles until either side changes.
+
+mod announce;
+mod neighbour;
+mod purse;
+#[cfg(test)]
+mod tests;
+
+use crate::ids::{FrameId, RobotId};
+use crate::replica::{Have, Replica};
+use crate::time::Instant;
+use crate::wire::{HaveRoot, HaveVector};
+use announce::Announce;
+use core::time::Duration;
+use neighbour::Neighbour;
+use purse::Purse;
+use rand::Rng;
+use rand::RngExt;
+use std::collections::BTreeMap;
+
+/// Questions a second, as long as each brings little...
+const QUESTIONS_PER_SEC: f64 = 0.8;
+/// ...and how many of them may follow a pause at once.
+const QUESTIONS_AT_ONCE: f64 = 6.0;
+
+/// What to do now.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Step {
+    /// Broadcast this.
+    Announce(HaveRoot),
+    /// Ask this neighbour what we lack; report with [`Spread::on_answer`].
+    Ask {
+        /// Whom.
+        peer: RobotId,
+        /// What we hold.
+        have: HaveVector,
+    },
+}
+
+/// What became of a question.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Answer {
+    /// No answer came.
+    Failed,
+    /// The neighbour could not read the question.
+    Refused,
+    /// Entries or proofs came.
+    Got {
+        /// Those that were new.
+        new: usize,
+        /// There is more to fetch.
+        more: bool,
+    },
+}
+
+/// The state of one robot's gossip about facts.
+#[derive(Clone, Debug)]
+pub struct Spread {
+    me: RobotId,
+    neighbours: BTreeMap<RobotId, Neighbour>,
+    announce: Announce,
+    purse: Purse,
+    answer_max: Duration,
+    wake: Instant,
+}
+
+impl Spread {
+    /// Nobody is known. Announcements rest for `have_secs` at most, questions wait `answer_secs` at most.
+    pub fn new(me: RobotId, have_secs: f64, answer_secs: f64, now: Instant) -> Self {
+        Self {
+            me,
+            neighbours: BTreeMap::new(),
+            announce: Announce::new(have_secs, now),
+            purse: Purse::new(QUESTIONS_PER_SEC, QUESTIONS_AT_ONCE, now),
+            answer_max: Duration::from_secs_f64(answer_secs),
+            wake: now,
+        }
+    }
+
+    /// The robots in reach.
+    pub fn neighbours(&self) -> impl Iterator<Item = RobotId> + '_ {
+        self.neighbours.keys().copied()
+    }
+
+    /// Whether a robot is in reach.
+    pub fn is_neighbour(&self, robot: RobotId) -> bool {
+        self.neighbours.contains_key(&robot)
+    }
+
+    /// When [`Spread::step`] wants to be called at the latest. Only `step` and the events below change it.
+    pub fn timeout(&self) -> Instant {
+        self.wake
+    }
+
+    /// A robot came into reach, or left. True if that is news.
+    pub fn on_neighbour(&mut self, now: Instant, robot: RobotId, up: bool, rng: &mut impl Rng) -> bool {
+        self.wake = now;
+        if !up {
+            return self.neighbours.remove(&robot).is_some();
+        }
+        if self.neighbours.contains_key(&robot) {
+            return false;
+        }
+        self.neighbours.insert(robot, Neighbour::default());
+        self.announce.hurry(now, rng.random_range(0.0..0.1));
+        true
+    }
+
+    /// A neighbour announced its root.
+    pub fn on_have(&mut self, now: Instant, replica: &Replica, from: RobotId, have: HaveRoot) {
+        let Some(neighbour) = self.neighbours.get_mut(&from) else { return };
+        self.wake = now;
+        neighbour.heard(now, have);
+        if have.root == replica.root() {
+            neighbour.ahead.clear();
+            self.announce.agrees();
+        } else if have.count <= replica.count() {
+            // It may lack something, and may not know.
+            self.announce.differs(now, replica.root());
+        }
+    }
+
+    /// A neighbour asks with this vector.
+    pub fn on_asked(&mut self, now: Instant, replica: &Replica, have: &Have) {
+        let Some(neighbour) = self.neighbours.get_mut(&have.asker) else { return };
+        let ahead = replica.ahead_of_us(have);
+        if !ahead.is_empty() {
+            self.wake = now;
+            neighbour.ahead = ahead;
+        }
+    }
+
+    /// A question was answered, or failed; what came was taken in.
+    pub fn on_answer(&mut self, now: Instant, replica: &Replica, peer: RobotId, answer: Answer) {
+        let Some(neighbour) = self.neighbours.get_mut(&peer) else { return };
+        self.wake = now;
+        neighbour.answered(now, replica.root(), answer);
+    }
+
+    /// The set of durable facts grew by `new`.
+    pub fn on_news(&mut self, now: Instant, new: usize) {
+        self.wake = now;
+        self.announce.news(now, new, self.neighbours.len());
+    }
+
+    /// The next thing to do, if any; call until `None`. While `busy` (entries on their way to the disk) nothing is asked:
+    /// our vector is stale, and what it lacks would be fetched twice.
+    pub fn step(&mut self, now: Instant, replica: &Replica, busy: bool, rng: &mut impl Rng) -> Option<Step> {
+        if self.neighbours.is_empty() {
+            self.wake = Instant::MAX; // Whoever comes is told.
+            return None;
+        }
+        let root = replica.have_root();
+        if self.announce.is_due(now, root.root, rng) {
+            return Some(Step::Announce(root));
+        }
+        self.wake = self.announce.next();
+        if busy {
+            return None; // Durable entries are news, and wake us.
+        }
+        let waits = self.neighbours.values().filter_map(|n| n.patience_ends(now, self.answer_max)).min();
+        if let Some(ends) = waits {
+            self.wake = self.wake.min(ends);
+            return None;
+        }
+        self.pull(now, replica, rng)
+    }
+
+    fn pull(&mut self, now: Instant, replica: &Replica, rng: &mut impl Rng) -> Option<Step> {
+        let (root, count) = (replica.root(), replica.count());
+        let strangers = self.neighbours.values().filter(|neighbour| neighbour.is_stranger()).count();
+        let mut best: Vec<(RobotId, f64)> = Vec::new();
+        for (robot, neighbour) in &mut self.neighbours {
+            match neighbour.promises(now, replica, (root, count), self.me < *robot, strangers) {
+                Ok(gain) => best.push((*robot, gain)),
+                Err(again) => self.wake = self.wake.min(again),
+            }
+        }
+        let most = best.iter().map(|(_, gain)| *gain).fold(0.0, f64::max);
+        if most <= 0.0 {
+            return None;
+        }
+        let due = self.purse.due(now, most);
+        if now < due {
+            self.wake = self.wake.min(due);
+            return None;
+        }
+        best.retain(|(_, gain)| 2.0 * gain >= most);
+        let (peer, _) = best[rng.random_range(0..best.len())];
+        let neighbour = self.neighbours.get_mut(&peer)?;
+        self.purse.pay(now, most, 1.0);
+        self.wake = now;
+        let have = neighbour.question(now, self.me, replica);
+        Some(Step::Ask { peer, have })
+    }
+}
+
+/// Logs a neighbour is known to have more of, and up to where; `None`: it knows them as forked.
+type Ahead = BTreeMap<FrameId, Option<u32>>;
