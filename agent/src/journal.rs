@@ -72,6 +72,8 @@ pub enum StoredRecord {
     Blob(Hash, Vec<u8>),
     /// Features and cloud of an own submap.
     Private(SubmapId, Vec<u8>),
+    /// Own epochs that must not be continued.
+    EpochClosed(u32),
 }
 
 impl From<&Record> for StoredRecord {
@@ -80,6 +82,7 @@ impl From<&Record> for StoredRecord {
             Record::Entry { id, bytes } => Self::Entry(*id, bytes.clone()),
             Record::Blob { hash, bytes } => Self::Blob(*hash, bytes.clone()),
             Record::Private { submap, bytes } => Self::Private(*submap, bytes.clone()),
+            Record::EpochClosed { epoch } => Self::EpochClosed(*epoch),
         }
     }
 }
@@ -90,6 +93,7 @@ impl From<StoredRecord> for Record {
             StoredRecord::Entry(id, bytes) => Self::Entry { id, bytes },
             StoredRecord::Blob(hash, bytes) => Self::Blob { hash, bytes },
             StoredRecord::Private(submap, bytes) => Self::Private { submap, bytes },
+            StoredRecord::EpochClosed(epoch) => Self::EpochClosed { epoch },
         }
     }
 }

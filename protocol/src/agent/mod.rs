@@ -75,7 +75,8 @@ pub enum StartError {
 pub struct Restored {
     /// All durable records, in any order.
     pub records: Vec<Record>,
-    /// The epoch to begin if the store is empty: larger than any this robot used before (seconds since 2020 serve).
+    /// The epoch to begin if the store is empty or must not be continued: larger than any this robot used before
+    /// (seconds since 2020 serve).
     pub fresh_epoch: u32,
 }
 
@@ -215,11 +216,14 @@ impl Agent {
     fn restore(&mut self, restored: Restored) {
         let mut entries = Vec::new();
         let mut private = Vec::new();
+        let mut closed = None;
+        let fresh_epoch = restored.fresh_epoch;
         for record in restored.records {
             match record {
                 Record::Entry { bytes, .. } => entries.push(bytes),
                 Record::Blob { bytes, .. } => self.keep_blob(bytes),
                 Record::Private { submap, bytes } => private.push((submap, bytes)),
+                Record::EpochClosed { epoch } => closed = closed.max(Some(epoch)),
             }
         }
         let loaded = self.replica.restore(entries);
@@ -228,9 +232,10 @@ impl Agent {
         }
         if let Err(damage) = loaded {
             self.reject(None, "store", &damage.to_string());
-            if damage.concerns(self.me.frame) {
-                self.begin_epoch(self.me.frame.epoch.saturating_add(1));
-            }
+            closed = closed.max(damage.concerns(self.me.frame).then_some(self.me.frame.epoch));
+        }
+        if let Some(closed) = closed.filter(|closed| *closed >= self.me.frame.epoch) {
+            self.begin_epoch(closed.saturating_add(1).max(fresh_epoch));
         }
         self.relearn();
         for (submap, bytes) in private {
@@ -239,11 +244,9 @@ impl Agent {
         self.resume_mapping();
     }
 
-    /// Writes a fact of our own; it takes effect once it is durable.
+    /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
+    /// here; what was under way waits for the disk with the rest.
     fn write(&mut self, epoch: u32, fact: &Fact) {
-        if self.receive_only {
-            return;
-        }
         match self.replica.append(&self.me.key, epoch, fact) {
             Ok(entry) => self.ledger.open.push(Record::Entry { id: entry.id(), bytes: entry.encode() }),
             Err(error) => {
@@ -293,10 +296,12 @@ impl Agent {
         }
     }
 
-    /// A new local frame begins: the trajectory so far is closed.
+    /// A new local frame begins: the trajectory so far is closed, for later runs as well, even if this one ends before
+    /// the new epoch has an entry.
     fn begin_epoch(&mut self, epoch: u32) {
         self.close_submap();
         self.me.frame.epoch = epoch;
+        self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
         self.mapper.restart(&self.config.submap);
         self.event(Event::EpochBegan { frame: self.me.frame });
     }
@@ -318,6 +323,10 @@ impl Agent {
     fn on_persisted(&mut self, up_to: u64) {
         let later = self.ledger.waiting.split_off(&up_to.saturating_add(1));
         let durable = core::mem::replace(&mut self.ledger.waiting, later);
+        if core::mem::take(&mut self.receive_only) {
+            self.negotiation.stir();
+            self.event(Event::StoreHealed);
+        }
         let mut own = Vec::new();
         for id in durable.into_values().flatten() {
             self.replica.mark_durable(id);

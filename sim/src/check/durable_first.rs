@@ -80,7 +80,7 @@ fn sendable(record: &Record) -> Option<Vec<u8>> {
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } => {
             (bytes.len() >= RECORD_LEN_MIN).then(|| bytes.clone())
         }
-        Record::Private { .. } => None,
+        Record::Private { .. } | Record::EpochClosed { .. } => None,
     }
 }
 

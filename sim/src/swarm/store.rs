@@ -17,6 +17,7 @@ enum Key {
     Entry(EntryId),
     Blob(Hash),
     Private(SubmapId),
+    EpochClosed(u32),
 }
 
 impl Store {
@@ -55,6 +56,7 @@ fn key(record: &Record) -> Key {
         Record::Entry { id, .. } => Key::Entry(*id),
         Record::Blob { hash, .. } => Key::Blob(*hash),
         Record::Private { submap, .. } => Key::Private(*submap),
+        Record::EpochClosed { epoch } => Key::EpochClosed(*epoch),
     }
 }
 
