@@ -188,7 +188,7 @@ impl Queue {
     /// The group is durable: its last number.
     fn take_group(&mut self) -> u64 {
         let len = self.group().count();
-        self.waiting.drain(..len).last().map_or(0, |batch| batch.number)
+        self.waiting.drain(..len).next_back().map_or(0, |batch| batch.number)
     }
 
     fn weight(&self) -> usize {

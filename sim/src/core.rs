@@ -6,6 +6,8 @@ use merganser_protocol::config::Config;
 use merganser_protocol::ids::{FrameId, Hash};
 use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::time::Instant;
+use merganser_protocol::wire::Head;
+use std::collections::BTreeMap;
 
 /// One robot's agent. The methods are those of [`Agent`].
 pub trait Core: Sized {
@@ -30,6 +32,8 @@ pub trait Core: Sized {
     fn frame(&self) -> FrameId;
     /// Digest of the set of entries it holds.
     fn digest(&self) -> Hash;
+    /// The lengths of the logs it holds durably; `None` for those with two histories.
+    fn logs(&self) -> BTreeMap<FrameId, Option<u32>>;
     /// What it believes; fakes have nothing to show.
     fn snapshot(&self, now: Instant) -> Option<Snapshot>;
 }
@@ -63,6 +67,22 @@ impl Core for Agent {
 
     fn digest(&self) -> Hash {
         Self::digest(self)
+    }
+
+    fn logs(&self) -> BTreeMap<FrameId, Option<u32>> {
+        let mut logs = BTreeMap::new();
+        let mut after = None;
+        loop {
+            let have = self.have_after(after);
+            logs.extend(have.heads.iter().map(|(frame, head)| match head {
+                Head::Log { len, .. } => (*frame, Some(*len)),
+                Head::Forked => (*frame, None),
+            }));
+            after = have.until;
+            if after.is_none() {
+                return logs;
+            }
+        }
     }
 
     fn snapshot(&self, now: Instant) -> Option<Snapshot> {

@@ -89,13 +89,10 @@ impl Disk {
         let mut draw = Draw(seed);
         let mut platter = lock(&self.0);
         let mut cut = Cut::default();
-        let main = platter.main.clone();
-        let after = lock(&main).after_cut(&mut draw, &mut cut);
-        platter.main = Arc::new(Mutex::new(Image::of(after)));
-        platter.spare = Arc::default();
-        let mut faults = lock(&platter.faults).clone();
+        let after = lock(&platter.main).after_cut(&mut draw, &mut cut);
+        platter.replace(Image::of(after));
+        let mut faults = lock(&platter.faults);
         (faults.dies_after, faults.died, faults.errors) = (None, false, 0);
-        platter.faults = Arc::new(Mutex::new(faults));
         cut
     }
 
@@ -103,13 +100,12 @@ impl Disk {
     pub fn let_go(&self) {
         let mut platter = lock(&self.0);
         let image = std::mem::take(&mut *lock(&platter.main));
-        platter.main = Arc::new(Mutex::new(image));
+        platter.replace(image);
     }
 
     /// An empty disk in its place.
     pub fn wipe(&self) {
-        let mut platter = lock(&self.0);
-        (platter.main, platter.spare) = Default::default();
+        lock(&self.0).replace(Image::default());
     }
 
     /// Flips one bit, if there is any.
@@ -139,7 +135,7 @@ impl Disk {
 
     /// Puts an image on it. Open handles are dead.
     pub fn restore(&self, picture: &Picture) {
-        lock(&self.0).main = Arc::new(Mutex::new(Image::of(picture.0.clone())));
+        lock(&self.0).replace(Image::of(picture.0.clone()));
     }
 
     /// Bytes of the database.
@@ -184,6 +180,16 @@ impl Medium for Disk {
         lock(&platter.faults).operate()?;
         platter.main = std::mem::take(&mut platter.spare);
         Ok(())
+    }
+}
+
+impl Platter {
+    /// Another image; what old handles still do touches neither it nor the faults.
+    fn replace(&mut self, image: Image) {
+        self.main = Arc::new(Mutex::new(image));
+        self.spare = Arc::default();
+        let faults = lock(&self.faults).clone();
+        self.faults = Arc::new(Mutex::new(faults));
     }
 }
 

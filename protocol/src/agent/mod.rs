@@ -22,7 +22,7 @@ use crate::config::{Config, ConfigError};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
 use crate::replica::{AppendError, IngestError, Ingested, Replica, RosterError};
 use crate::time::Instant;
-use crate::wire::EntryBytes;
+use crate::wire::{EntryBytes, HaveVector};
 use crate::wire::fact::Fact;
 use ed25519_dalek::SigningKey;
 use gossip::Gossip;
@@ -204,6 +204,11 @@ impl Agent {
     /// The frame that this robot writes now.
     pub fn frame(&self) -> FrameId {
         self.me.frame
+    }
+
+    /// What it holds: the lengths of its logs, and which have two histories, for those after `after`.
+    pub fn have_after(&self, after: Option<FrameId>) -> HaveVector {
+        self.replica.have_after(after)
     }
 
     /// BLAKE3 digest of the set of durable entries held: equal sets, equal digests.
