@@ -199,6 +199,7 @@ impl Queue {
 fn weight(batch: &Batch) -> usize {
     let bytes = |record: &Record| match record {
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } | Record::Private { bytes, .. } => bytes.len(),
+        Record::Fork { proof, .. } => proof.iter().map(Vec::len).sum(),
         Record::EpochClosed { .. } => 0,
     };
     batch.records.iter().map(bytes).sum()

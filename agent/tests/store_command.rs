@@ -52,7 +52,7 @@ fn a_sound_store_is_verified_counted_and_exported() {
     write(dir.path(), &[log(1, 7, 3, "test"), log(2, 8, 4, "test")].concat());
     let (code, said, _) = merganser(dir.path(), &["store", "verify", "-c", "a.toml"]);
     assert_eq!(code, Some(0), "{said}");
-    assert!(said.ends_with("7 entries, 0 blobs, 0 private records: sound\n"), "{said}");
+    assert!(said.ends_with("7 entries, 0 blobs, 0 private records, 0 forks: sound\n"), "{said}");
     let (code, said, _) = merganser(dir.path(), &["store", "stats", "-c", "a.toml"]);
     assert_eq!(code, Some(0));
     for part in ["schema 2, of test/alpha", "0 damaged", "alpha/7 ", "beta/8 ", "2 logs"] {

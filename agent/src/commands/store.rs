@@ -103,7 +103,8 @@ fn verify(config: &Path) -> Result<bool> {
     let unlisted = seen.damaged_count - seen.damaged.len();
     let keys = keys(&config)?;
     let mut entries = Vec::new();
-    let (mut blobs, mut private) = (0, 0);
+    let (mut blobs, mut private, mut forks) = (0, 0, 0);
+    let mut proofs = Vec::new();
     for record in &seen.records {
         match record {
             Record::Entry { id, bytes } => {
@@ -118,6 +119,10 @@ fn verify(config: &Path) -> Result<bool> {
                 private += 1;
                 wrong.extend(Features::decode(bytes).err().map(|why| format!("private: {submap}: {why}")));
             }
+            Record::Fork { frame, proof: [a, b] } => {
+                forks += 1;
+                proofs.push((*frame, a.clone(), b.clone()));
+            }
             Record::EpochClosed { .. } => {}
         }
     }
@@ -131,8 +136,12 @@ fn verify(config: &Path) -> Result<bool> {
             wrong.push(format!("chain: {what}: {why}"));
         }
     }
+    // A fork that was noticed and proven is somebody's fault, not the store's.
     for (frame, _) in replica.forks() {
-        wrong.push(format!("chain: log {frame} has two histories; it is quarantined"));
+        wrong.push(format!("chain: log {frame} has two histories"));
+    }
+    for (frame, a, b) in proofs {
+        wrong.extend(replica.ingest_fork(&a, &b).err().map(|why| format!("forks: {frame}: {why}")));
     }
     for line in &wrong {
         say(line)?;
@@ -144,7 +153,10 @@ fn verify(config: &Path) -> Result<bool> {
         0 => "sound".into(),
         n => format!("{n} wrong"),
     };
-    say(&format!("store {}: {count} entries, {blobs} blobs, {private} private records: {verdict}", place(&config)))?;
+    say(&format!(
+        "store {}: {count} entries, {blobs} blobs, {private} private records, {forks} forks: {verdict}",
+        place(&config)
+    ))?;
     Ok(wrong.is_empty())
 }
 
@@ -171,16 +183,17 @@ fn keys(config: &FileConfig) -> Result<BTreeMap<RobotId, VerifyingKey>> {
 fn stats(config: &Path) -> Result<bool> {
     let (config, seen) = open(config)?;
     let mut logs: BTreeMap<FrameId, (u64, u64)> = BTreeMap::new();
-    let mut others = BTreeMap::from([("blobs", (0, 0)), ("private", (0, 0))]);
+    let mut others = BTreeMap::from([("blobs", (0, 0)), ("forks", (0, 0)), ("private", (0, 0))]);
     for record in &seen.records {
         let (row, bytes): (&mut (u64, u64), _) = match record {
-            Record::Entry { id, bytes } => (logs.entry(id.frame).or_default(), bytes),
-            Record::Blob { bytes, .. } => (others.entry("blobs").or_default(), bytes),
-            Record::Private { bytes, .. } => (others.entry("private").or_default(), bytes),
+            Record::Entry { id, bytes } => (logs.entry(id.frame).or_default(), bytes.len()),
+            Record::Blob { bytes, .. } => (others.entry("blobs").or_default(), bytes.len()),
+            Record::Private { bytes, .. } => (others.entry("private").or_default(), bytes.len()),
+            Record::Fork { proof: [a, b], .. } => (others.entry("forks").or_default(), a.len() + b.len()),
             Record::EpochClosed { .. } => continue,
         };
         row.0 += 1;
-        row.1 += bytes.len() as u64;
+        row.1 += bytes as u64;
     }
     let names: BTreeMap<RobotId, _> =
         config.roster.iter().map(|(name, key)| (RobotId::of_key(&key.to_bytes()), name)).collect();

@@ -1,7 +1,7 @@
 //! Reading a whole store without trusting it: what is sound, what is not, and whether an entry may be missing.
 
 use crate::mend::Medium;
-use crate::tables::{self, BLOBS, ENTRIES, META, PRIVATE, number, split_key, unseal};
+use crate::tables::{self, BLOBS, ENTRIES, FORKS, META, PRIVATE, number, split_key, unseal};
 use crate::{SCHEMA, StoreError, mend};
 use merganser_protocol::agent::io::Record;
 use merganser_protocol::ids::{EntryId, Hash, SubmapId};
@@ -91,6 +91,9 @@ pub(crate) fn read(db: &mut Database) -> Result<Inspection, String> {
             seen.read_entries(db, version);
             seen.read_blobs(db, version);
             seen.read_private(db, version);
+            if version >= SCHEMA {
+                seen.read_forks(db);
+            }
         }
     }
     Ok(seen)
@@ -195,6 +198,16 @@ impl Inspection {
             match if version < SCHEMA { Some(&value[..]) } else { unseal("private", &key, &value) } {
                 Some(bytes) => self.records.push(Record::Private { submap, bytes: bytes.to_vec() }),
                 None => self.add("private", submap.to_string(), "its bytes have changed".into()),
+            }
+        }
+    }
+
+    fn read_forks(&mut self, db: &Database) {
+        for (key, value) in self.scan(db, FORKS, "forks") {
+            let (frame, _) = split_key(key);
+            match unseal("forks", &key, &value).and_then(tables::split_proof) {
+                Some(proof) => self.records.push(Record::Fork { frame, proof }),
+                None => self.add("forks", frame.to_string(), "its bytes have changed".into()),
             }
         }
     }

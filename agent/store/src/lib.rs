@@ -12,7 +12,8 @@
 //!   again. After anything but a full disk the records are first copied into a new file, since a kernel forgets pages
 //!   that it could not write.
 //!
-//! Tables: `entries` (robot, epoch, seq), `blobs` (hash), `private` (robot, epoch, index), `meta`; values are sealed.
+//! Tables: `entries` (robot, epoch, seq), `blobs` (hash), `private` (robot, epoch, index),
+//! `forks` (robot, epoch), `meta`; values are sealed.
 
 mod error;
 mod file;

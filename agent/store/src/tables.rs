@@ -12,6 +12,7 @@ use std::any::Any;
 pub(crate) const ENTRIES: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition::new("entries");
 pub(crate) const BLOBS: TableDefinition<'_, [u8; 32], &[u8]> = TableDefinition::new("blobs");
 pub(crate) const PRIVATE: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition::new("private");
+pub(crate) const FORKS: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition::new("forks");
 pub(crate) const META: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("meta");
 
 /// Keys of `meta`. The schema is not sealed: its place and form are the same in all versions.
@@ -57,6 +58,18 @@ pub(crate) fn split_key(key: [u8; 16]) -> (FrameId, u32) {
     (FrameId { robot, epoch: (number >> 32) as u32 }, number as u32)
 }
 
+/// The length of the first, and both.
+fn join_proof([a, b]: &[Vec<u8>; 2]) -> Vec<u8> {
+    [&u32::try_from(a.len()).unwrap_or(u32::MAX).to_le_bytes()[..], a, b].concat()
+}
+
+/// The two entries of a proof.
+pub(crate) fn split_proof(bytes: &[u8]) -> Option<[Vec<u8>; 2]> {
+    let (len, rest) = bytes.split_first_chunk()?;
+    let (a, b) = rest.split_at_checked(u32::from_le_bytes(*len) as usize)?;
+    Some([a.to_vec(), b.to_vec()])
+}
+
 /// One synced, atomic transaction. On an error nothing of it is stored.
 pub(crate) fn write(
     db: &Database,
@@ -74,6 +87,7 @@ pub(crate) fn make(transaction: &WriteTransaction) -> Result<(), CommitError> {
     transaction.open_table(ENTRIES)?;
     transaction.open_table(BLOBS)?;
     transaction.open_table(PRIVATE)?;
+    transaction.open_table(FORKS)?;
     transaction.open_table(META)?;
     Ok(())
 }
@@ -101,6 +115,11 @@ fn put(transaction: &WriteTransaction, record: &Record) -> Result<(), CommitErro
         Record::Private { submap, bytes } => {
             let key = join_key(submap.frame, submap.index);
             insert(transaction, PRIVATE, "private", key, &key, bytes)?;
+            Ok(())
+        }
+        Record::Fork { frame, proof } => {
+            let key = join_key(*frame, 0);
+            insert(transaction, FORKS, "forks", key, &key, &join_proof(proof))?;
             Ok(())
         }
         Record::EpochClosed { epoch } => {

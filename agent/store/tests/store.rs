@@ -27,6 +27,7 @@ fn all_kinds_of_records_survive_a_restart_with_the_epoch() {
         entry(1, b""),
         Record::Blob { hash: Hash::of(b"blob"), bytes: b"blob".to_vec() },
         Record::Private { submap, bytes: vec![1; 100_000] },
+        Record::Fork { frame: submap.frame, proof: [b"one".to_vec(), b"other".to_vec()] },
         Record::EpochClosed { epoch: 7 },
     ];
     let mut opened = open(&path, 77).unwrap();

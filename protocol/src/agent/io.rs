@@ -199,6 +199,14 @@ pub enum Record {
         /// Encoded features and cloud.
         bytes: Vec<u8>,
     },
+    /// Proof that a log has two histories: two entries that contradict each other. Without it a restart would take the
+    /// log out of quarantine.
+    Fork {
+        /// The log.
+        frame: FrameId,
+        /// The canonical bytes of the two entries.
+        proof: [Vec<u8>; 2],
+    },
     /// This robot's own epochs up to this one must not be continued, in no later run: a new one was begun, or entries
     /// that others may hold were lost. The largest counts.
     EpochClosed {

@@ -22,8 +22,8 @@ use crate::config::{Config, ConfigError};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
 use crate::replica::{AppendError, IngestError, Ingested, Replica, RosterError};
 use crate::time::Instant;
-use crate::wire::{EntryBytes, HaveVector};
 use crate::wire::fact::Fact;
+use crate::wire::{EntryBytes, HaveVector};
 use ed25519_dalek::SigningKey;
 use gossip::Gossip;
 use io::{Command, Event, Input, JobId, Output, QueryId, Record};
@@ -221,6 +221,7 @@ impl Agent {
     fn restore(&mut self, restored: Restored) {
         let mut entries = Vec::new();
         let mut private = Vec::new();
+        let mut forks = Vec::new();
         let mut closed = None;
         let fresh_epoch = restored.fresh_epoch;
         for record in restored.records {
@@ -228,10 +229,16 @@ impl Agent {
                 Record::Entry { bytes, .. } => entries.push(bytes),
                 Record::Blob { bytes, .. } => self.keep_blob(bytes),
                 Record::Private { submap, bytes } => private.push((submap, bytes)),
+                Record::Fork { proof, .. } => forks.push(proof),
                 Record::EpochClosed { epoch } => closed = closed.max(Some(epoch)),
             }
         }
         let loaded = self.replica.restore(entries);
+        for [a, b] in forks {
+            if let Err(error) = self.replica.ingest_fork(&a, &b) {
+                self.reject(None, "store: fork", &error.to_string());
+            }
+        }
         if let Some(epoch) = self.replica.epochs_of(self.me.robot).next_back() {
             self.me.frame.epoch = epoch;
         }
@@ -276,6 +283,7 @@ impl Agent {
             Ok(Ingested::Known | Ingested::Early(_)) => {}
             Err(error @ IngestError::Fork(frame)) => {
                 self.reject(Some(frame.robot), error.reason(), &error.to_string());
+                self.keep_proof(frame);
                 self.relearn();
             }
             Err(error) => self.reject(from, error.reason(), &error.to_string()),
@@ -287,11 +295,19 @@ impl Agent {
         match self.replica.ingest_fork(&a.0, &b.0) {
             Ok((frame, true)) => {
                 self.reject(Some(frame.robot), "fork", &format!("log {frame} has two histories; it is quarantined"));
+                self.keep_proof(frame);
                 self.relearn();
             }
             Ok((_, false)) => {}
             Err(error) => self.reject(Some(from), error.reason(), &error.to_string()),
         }
+    }
+
+    /// A log that is in quarantine stays there over restarts.
+    fn keep_proof(&mut self, frame: FrameId) {
+        let proof = self.replica.forks().find(|(forked, _)| *forked == frame);
+        let proof = proof.map(|(_, proof)| [proof.a.clone(), proof.b.clone()]);
+        self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
     }
 
     /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide.

@@ -19,10 +19,13 @@ struct Held {
     epoch: u32,
     /// Entries handed to the disk, by batch.
     waiting: Vec<(u64, EntryId)>,
+    /// Proofs of forks, likewise.
+    proofs: Vec<(u64, FrameId)>,
 }
 
 #[derive(Debug, Default)]
 struct Log {
+    /// Its quarantine is on disk, and seen.
     forked: bool,
     /// Entries `0..len` were durable.
     len: u32,
@@ -50,8 +53,10 @@ impl Held {
         let name = &robot.name;
         for (frame, log) in &mut self.logs {
             match robot.logs.get(frame) {
-                Some(None) => log.forked = true,
-                Some(Some(_)) if log.forked => return Err(format!("{name}: the quarantine of log {frame} was lifted")),
+                Some(None) => log.len = 0,
+                Some(Some(_)) | None if log.forked => {
+                    return Err(format!("{name}: the quarantine of log {frame} was lifted"));
+                }
                 Some(Some(len)) if *len >= log.len => log.len = *len,
                 _ if log.len == 0 => {}
                 now => {
@@ -62,7 +67,7 @@ impl Held {
         }
         for (frame, len) in &robot.logs {
             let log = self.logs.entry(*frame).or_default();
-            (log.forked, log.len) = (len.is_none(), len.unwrap_or(log.len));
+            log.len = len.unwrap_or(0);
         }
         let Some(snapshot) = &robot.snapshot else { return Ok(()) };
         let epoch = snapshot.status.epoch;
@@ -83,6 +88,10 @@ impl Check for NeverBack {
         let held = self.robots.entry(robot).or_default();
         match seen {
             Seen::Output(Output::Persist { batch, records }) => {
+                held.proofs.extend(records.iter().filter_map(|record| match record {
+                    Record::Fork { frame, .. } => Some((*batch, *frame)),
+                    _ => None,
+                }));
                 held.waiting.extend(records.iter().filter_map(|record| match record {
                     Record::Entry { id, .. } => Some((*batch, *id)),
                     _ => None,
@@ -91,10 +100,13 @@ impl Check for NeverBack {
             Seen::Durable(batch) => {
                 let (durable, later): (Vec<_>, Vec<_>) = held.waiting.iter().partition(|(number, _)| number <= batch);
                 held.waiting = later;
+                let (forked, later): (Vec<_>, Vec<_>) = held.proofs.iter().partition(|(number, _)| number <= batch);
+                held.proofs = later;
+                forked.into_iter().for_each(|(_, frame)| held.logs.entry(frame).or_default().forked = true);
                 durable.into_iter().for_each(|(_, id)| held.logs.entry(id.frame).or_default().add(id.seq));
             }
             // An epoch that was begun and had no entry yet may die with its process.
-            Seen::Died => (held.waiting, held.epoch) = (Vec::new(), 0),
+            Seen::Died => (held.waiting, held.proofs, held.epoch) = (Vec::new(), Vec::new(), 0),
             Seen::Wiped | Seen::Damaged => held.forget(),
             _ => {}
         }
@@ -145,6 +157,13 @@ mod tests {
     fn it_bites_on_a_quarantine_that_is_lifted() {
         let mut check = NeverBack::default();
         assert!(look(&mut check, Some(3)).is_ok());
+        assert!(look(&mut check, None).is_ok());
+        assert!(look(&mut check, Some(3)).is_ok(), "the proof died before it was on disk");
+        let output =
+            Output::Persist { batch: 1, records: vec![Record::Fork { frame: FRAME, proof: [vec![], vec![]] }] };
+        check.see(0, &Seen::Output(&output)).unwrap();
+        check.see(0, &Seen::Durable(1)).unwrap();
+        check.see(0, &Seen::Died).unwrap();
         assert!(look(&mut check, None).is_ok());
         assert!(look(&mut check, Some(3)).is_err());
     }

@@ -1,7 +1,7 @@
 //! Looking at the swarm: samples for the checks, and where frames truly lie.
 
 use super::robot::Robot;
-use super::{Event, Swarm, all_done};
+use super::{Event, Swarm, all_agree, all_done};
 use crate::check::{Phase, RobotSample, Sample, Seen};
 use crate::core::Core;
 use crate::network::millis;
@@ -34,6 +34,7 @@ impl<C: Core> Swarm<C> {
     pub(super) fn sample(&mut self, now: Instant) {
         let robots = self.robot_samples(now);
         self.pin_frames(&robots);
+        self.agreed_since = self.agreed_since.or(Some(now)).filter(|_| self.healed && all_agree(&robots));
         let done = self.healed && all_done(&robots);
         self.done_samples = if done { self.done_samples + 1 } else { 0 };
         let phase = if self.healed { Phase::Calm } else { Phase::Storm };

@@ -78,6 +78,7 @@ pub struct Swarm<C> {
     violation: Option<Violation>,
     healed: bool,
     done_samples: u32,
+    agreed_since: Option<Instant>,
     events: u64,
     /// The virtual second that events are being counted in, and how many it has had.
     second: (u64, u64),
@@ -99,6 +100,8 @@ pub struct Outcome<C> {
     pub trace_lines: u64,
     /// Virtual time at the end.
     pub ended: Instant,
+    /// Since when all hold the same facts, as sampled after the healing.
+    pub agreed_since: Option<Instant>,
     /// Whether all held the same facts and had nothing left to do when it ended.
     pub idle: bool,
     /// Events handled.
@@ -193,6 +196,7 @@ impl<C: Core> Swarm<C> {
             violation: None,
             healed: false,
             done_samples: 0,
+            agreed_since: None,
             events: 0,
             second: (0, 0),
         })
@@ -243,6 +247,7 @@ impl<C: Core> Swarm<C> {
             trace: self.trace.hash(),
             trace_lines: self.trace.lines(),
             ended,
+            agreed_since: self.agreed_since,
             idle: all_done(&robots),
             events: self.events,
             counts: self.counts,
@@ -321,9 +326,12 @@ impl Event {
     }
 }
 
+fn all_agree(robots: &[RobotSample]) -> bool {
+    robots.windows(2).all(|pair| pair[0].digest == pair[1].digest)
+}
+
 fn all_done(robots: &[RobotSample]) -> bool {
-    let same = robots.windows(2).all(|pair| pair[0].digest == pair[1].digest);
-    same && robots.iter().all(|robot| robot.snapshot.as_ref().is_none_or(|s| s.status.idle))
+    all_agree(robots) && robots.iter().all(|robot| robot.snapshot.as_ref().is_none_or(|s| s.status.idle))
 }
 
 fn secs(secs: f64) -> Instant {

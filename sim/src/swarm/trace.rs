@@ -104,6 +104,7 @@ fn records_digest(records: &[Record]) -> [u8; 32] {
             Record::Entry { id, bytes } => (format!("entry {id}"), &bytes[..]),
             Record::Blob { hash, bytes } => (format!("blob {hash}"), &bytes[..]),
             Record::Private { submap, bytes } => (format!("private {submap}"), &bytes[..]),
+            Record::Fork { frame, proof } => (format!("fork {frame}"), &proof[1][..]),
             Record::EpochClosed { epoch } => (format!("closed {epoch}"), &[][..]),
         };
         for part in [kind.as_bytes(), bytes] {

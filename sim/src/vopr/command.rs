@@ -70,8 +70,8 @@ pub fn run(args: &VoprArgs) -> anyhow::Result<bool> {
         say(&one_line(report))?;
     }
     say(&format!(
-        "{} seeds, {} broken; {:.0} virtual s in {wall:.1} s ({:.2} s a seed); slowest to settle: {:.1} s (seed {}), allowed \
-         {SETTLE_SECS} s",
+        "{} seeds, {} broken; {:.0} virtual s in {wall:.1} s ({:.2} s a seed); slowest to agree after the \
+         healing: {:.1} s (seed {}), allowed {SETTLE_SECS} s",
         tally.seeds,
         tally.broken.len(),
         tally.virtual_secs,
@@ -114,7 +114,7 @@ fn run_band(band: Band, args: &VoprArgs) -> anyhow::Result<BTreeMap<u64, SeedRep
 fn one_line(report: &SeedReport) -> String {
     let verdict = if report.violation.is_some() { "broken" } else { "good" };
     format!(
-        "seed {} {verdict}: {} robots, {} entries at the end, ended at {:.1} s, {:.1} s after the healing, trace {}",
+        "seed {} {verdict}: {} robots, {} entries at the end, ended at {:.1} s, all agreed {:.1} s after the healing, trace {}",
         report.seed, report.robots, report.entries, report.ended_secs, report.settled_secs, report.trace
     )
 }

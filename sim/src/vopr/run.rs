@@ -22,7 +22,7 @@ pub struct SeedReport {
     pub robots: usize,
     /// Virtual time at the end, s.
     pub ended_secs: f64,
-    /// From the healing to the end, s.
+    /// From the healing until all held the same facts for good, s.
     pub settled_secs: f64,
     /// Entries held at the end.
     pub entries: u64,
@@ -81,7 +81,7 @@ fn one<C: Core>(seed: u64) -> SeedReport {
         violation: outcome.violation,
         robots,
         ended_secs,
-        settled_secs: (ended_secs - storm).max(0.0),
+        settled_secs: (outcome.agreed_since.unwrap_or(outcome.ended).as_secs_f64() - storm).max(0.0),
         entries,
         faults: outcome.counts,
     }
