@@ -6,9 +6,8 @@ use crate::bar::progress_bar;
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
-use std::sync::Mutex;
-use std::sync::PoisonError;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 /// Of a band, each seed of which this is a divisor runs twice, and must leave one trace.
@@ -33,6 +32,9 @@ pub struct VoprArgs {
     /// Run every seed twice and compare the traces (a band does so with every sixteenth)
     #[arg(long)]
     pub twice: bool,
+    /// Begin no further seed once an invariant broke
+    #[arg(long)]
+    pub fail_fast: bool,
     /// Write what was counted here, as JSON
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
@@ -89,18 +91,19 @@ pub fn run(args: &VoprArgs) -> anyhow::Result<bool> {
 fn run_band(band: Band, args: &VoprArgs) -> anyhow::Result<BTreeMap<u64, SeedReport>> {
     let jobs = args.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
     let bar = progress_bar(band.1 - band.0, "seeds")?;
-    let next = AtomicU64::new(band.0);
+    let (next, broken) = (AtomicU64::new(band.0), AtomicBool::new(false));
     let reports = Mutex::new(BTreeMap::new());
     std::thread::scope(|scope| {
         for _ in 0..jobs {
             scope.spawn(|| {
                 loop {
                     let seed = next.fetch_add(1, Ordering::Relaxed);
-                    if seed >= band.1 {
+                    if seed >= band.1 || (args.fail_fast && broken.load(Ordering::Relaxed)) {
                         return;
                     }
                     let twice = args.twice || seed.is_multiple_of(TWICE_EVERY);
                     let report = run_seed(seed, twice);
+                    broken.fetch_or(report.violation.is_some(), Ordering::Relaxed);
                     reports.lock().unwrap_or_else(PoisonError::into_inner).insert(seed, report);
                     bar.inc(1);
                 }
