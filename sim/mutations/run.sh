@@ -5,10 +5,11 @@
 # Exits with 0 only if every bug was found.
 set -eu
 root=$(git -C "$(dirname "$0")" rev-parse --show-toplevel)
-copy=$(mktemp -d)
-trap 'rm -rf "$copy"' EXIT
 seeds=${SEEDS:-0..200}
 export CARGO_TARGET_DIR="${CARGO_TARGET_DIR:-$root/target/mutations}"
+# One place for all copies, so that they share what they build.
+copy=$CARGO_TARGET_DIR/mutant-source
+mkdir -p "$copy"
 missed=0
 
 if [ $# -eq 0 ]; then
