@@ -304,7 +304,8 @@ impl<C: Core, N: Network> Driver<C, N> {
 fn tell(event: &Event) {
     match event {
         Event::Rejected { name, reason, suppressed, .. } => warn!(peer = name, reason, suppressed, "refused input"),
-        Event::ReceiveOnly { reason } => error!(reason, "the store failed: no facts of our own are written any more"),
+        Event::ReceiveOnly { reason } => error!(reason, "the store fails: receive-only until it works again"),
+        Event::StoreHealed => warn!("the store works again; nothing was lost"),
         Event::Merged { frame } => info!(%frame, "merged"),
         Event::Unmerged { frame } => warn!(%frame, "no longer merged"),
         Event::EpochBegan { frame } => info!(%frame, "a new epoch begins"),

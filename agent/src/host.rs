@@ -7,8 +7,9 @@ use crate::journal::{self, Start};
 use crate::link::Link;
 use crate::link::session::LinkError;
 use crate::queue::{Inbox, queue};
-use crate::store::{self, Store, StoreError};
+use crate::store;
 use merganser_protocol::agent::{Agent, StartError};
+use merganser_store::{Opened, Store, StoreError};
 use rand::TryRng;
 use std::io;
 use std::path::PathBuf;
@@ -80,8 +81,7 @@ impl Host {
     /// [`HostError`].
     pub async fn start(config: FileConfig, options: Options) -> Result<Self, HostError> {
         let identity = config.identity()?;
-        let store = Store::open(&config.store.path, &identity.swarm, &identity.name)?;
-        let restored = store.load()?;
+        let Opened { store, restored, report } = store::open(&config)?;
         info!(records = restored.records.len(), store = %config.store.path.display(), "store read");
         let seed = match options.seed {
             Some(seed) => seed,
@@ -94,7 +94,9 @@ impl Host {
             journal::Writer::create(&path, start).map_err(|source| HostError::Journal { path, source })
         });
         let core = Agent::new(config.core.clone(), identity, seed, restored, now)?;
-        Self::assemble(&config, core, store, journal.transpose()?, clock).await
+        let host = Self::assemble(&config, core, store, journal.transpose()?, clock).await?;
+        (0..report.damaged_count).for_each(|_| host.inbox.drops.count("store: damaged record"));
+        Ok(host)
     }
 
     /// Starts an agent around any core (tests use stand-ins).

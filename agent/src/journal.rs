@@ -9,7 +9,7 @@ use crate::observation::{KeyframeMessage, ObservationError};
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, JobId, QueryId, QueryKind, Record, Sighting};
 use merganser_protocol::agent::{Identity, Restored};
 use merganser_protocol::config::Config;
-use merganser_protocol::ids::{EntryId, Hash, Name, RobotId, SubmapId};
+use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
 use merganser_protocol::time::Instant;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -72,6 +72,10 @@ pub enum StoredRecord {
     Blob(Hash, Vec<u8>),
     /// Features and cloud of an own submap.
     Private(SubmapId, Vec<u8>),
+    /// Proof that a log has two histories.
+    Fork(FrameId, [Vec<u8>; 2]),
+    /// Own epochs that must not be continued.
+    EpochClosed(u32),
 }
 
 impl From<&Record> for StoredRecord {
@@ -80,6 +84,8 @@ impl From<&Record> for StoredRecord {
             Record::Entry { id, bytes } => Self::Entry(*id, bytes.clone()),
             Record::Blob { hash, bytes } => Self::Blob(*hash, bytes.clone()),
             Record::Private { submap, bytes } => Self::Private(*submap, bytes.clone()),
+            Record::Fork { frame, proof } => Self::Fork(*frame, proof.clone()),
+            Record::EpochClosed { epoch } => Self::EpochClosed(*epoch),
         }
     }
 }
@@ -90,6 +96,8 @@ impl From<StoredRecord> for Record {
             StoredRecord::Entry(id, bytes) => Self::Entry { id, bytes },
             StoredRecord::Blob(hash, bytes) => Self::Blob { hash, bytes },
             StoredRecord::Private(submap, bytes) => Self::Private { submap, bytes },
+            StoredRecord::Fork(frame, proof) => Self::Fork { frame, proof },
+            StoredRecord::EpochClosed(epoch) => Self::EpochClosed { epoch },
         }
     }
 }

@@ -11,7 +11,7 @@ use merganser::host::Host;
 use merganser::keys;
 use merganser::link::session::{self, Role};
 use merganser::observation::KeyframeMessage;
-use merganser::store::Store;
+use merganser::store;
 use merganser_protocol::agent::io::{Channel, Input, Output, QueryId, QueryKind};
 use merganser_protocol::ids::RobotId;
 use merganser_protocol::snapshot::StatusView;
@@ -20,7 +20,7 @@ use std::time::Duration;
 use zenoh::Session;
 
 async fn puppet(config: &FileConfig, core: &Puppet) -> Host {
-    let store = Store::open(&config.store.path, &config.swarm, &config.robot).unwrap();
+    let store = store::open(config).unwrap().store;
     Host::assemble(config, core.clone(), store, None, Clock::start()).await.unwrap()
 }
 

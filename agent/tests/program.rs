@@ -5,7 +5,7 @@ mod common;
 
 use common::{PATIENCE, swarm};
 use merganser::config::FileConfig;
-use merganser::store::Store;
+use merganser::store;
 use merganser_protocol::agent::io::Record;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -136,8 +136,7 @@ fn an_agent_that_is_ended_in_mid_drive_keeps_the_submap_it_was_in() {
     let ended = terminate(agent);
     assert_eq!(ended.status.code(), Some(0), "{}", text(&ended.stderr));
     let config = FileConfig::load(&folder.join("alpha.toml")).unwrap();
-    let store = Store::open(&config.store.path, &config.swarm, &config.robot).unwrap();
-    let records = store.load().unwrap().records;
+    let records = store::open(&config).unwrap().restored.records;
     assert!(records.iter().any(|record| matches!(record, Record::Entry { .. })), "{records:?}");
 }
 

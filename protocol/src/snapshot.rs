@@ -76,7 +76,7 @@ pub struct StatusView {
     pub idle: bool,
     /// Names of robots of which at least one frame is merged with this robot's present frame.
     pub merged_with: Vec<String>,
-    /// Storage failed: facts of our own are no longer written.
+    /// The store fails: nothing new of our own is begun, and nothing received counts, until it works again.
     pub receive_only: bool,
 }
 

@@ -203,6 +203,29 @@ fn a_full_disk_turns_the_agent_into_a_listener_and_says_so() {
         assert!(!drain(&mut agent).iter().any(|o| matches!(o, Output::Persist { .. } | Output::Run { .. })));
     }
     assert!(agent.status().receive_only);
+    // The store works again: what was held back is done, nothing was lost.
+    agent.handle(Instant::ZERO, Input::Persisted { up_to: 0 });
+    let healed = drain(&mut agent);
+    assert!(healed.iter().any(|o| matches!(o, Output::Event(Event::StoreHealed))));
+    assert!(healed.iter().any(|o| matches!(o, Output::Run { .. })), "{healed:?}");
+    assert!(!agent.status().receive_only);
+}
+
+#[test]
+fn a_closed_epoch_is_not_continued_by_any_later_run() {
+    let closed = |epoch| Record::EpochClosed { epoch };
+    let epoch = |records, fresh_epoch| agent(0, Restored { records, fresh_epoch }).frame().epoch;
+    assert_eq!(epoch(vec![closed(5)], 3), 6, "the clock went back");
+    assert_eq!(epoch(vec![closed(5), closed(2)], 9), 9);
+    // A new epoch that dies before its first entry is not forgotten.
+    let mut before = agent(0, Restored { records: vec![], fresh_epoch: 4 });
+    before.handle(Instant::ZERO, Input::Command(Command::NewEpoch));
+    let kept = drain(&mut before).into_iter().find_map(|output| match output {
+        Output::Persist { records, .. } => Some(records),
+        _ => None,
+    });
+    assert_eq!(before.frame().epoch, 5);
+    assert_eq!(epoch(kept.unwrap(), 4), 5);
 }
 
 #[test]

@@ -6,6 +6,7 @@ use merganser_protocol::config::Config;
 use merganser_protocol::ids::{FrameId, Hash};
 use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::time::Instant;
+use std::collections::BTreeMap;
 
 /// One robot's agent. The methods are those of [`Agent`].
 pub trait Core: Sized {
@@ -30,6 +31,8 @@ pub trait Core: Sized {
     fn frame(&self) -> FrameId;
     /// Digest of the set of entries it holds.
     fn digest(&self) -> Hash;
+    /// The lengths of the logs it holds durably; `None` for those with two histories.
+    fn logs(&self) -> BTreeMap<FrameId, Option<u32>>;
     /// What it believes; fakes have nothing to show.
     fn snapshot(&self, now: Instant) -> Option<Snapshot>;
 }
@@ -63,6 +66,10 @@ impl Core for Agent {
 
     fn digest(&self) -> Hash {
         Self::digest(self)
+    }
+
+    fn logs(&self) -> BTreeMap<FrameId, Option<u32>> {
+        self.heads().collect()
     }
 
     fn snapshot(&self, now: Instant) -> Option<Snapshot> {

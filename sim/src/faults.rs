@@ -70,12 +70,111 @@ pub enum Fault {
         /// Which robot.
         robot: String,
     },
-    /// The disk takes nothing: every batch fails. Ends for good with the next kill of this robot.
+    /// The power goes, and comes back: what no sync confirmed is lost, there, or torn.
+    PowerCut {
+        /// Start, s.
+        at: f64,
+        /// Time until it runs again, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+        /// It goes in the middle of the next commit, after so many writes (if there is one within a second).
+        #[serde(default)]
+        mid_commit: Option<u64>,
+    },
+    /// The disk has no room.
     DiskFull {
+        /// Start, s.
+        at: f64,
+        /// Duration, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+    },
+    /// So many writes and syncs fail.
+    DiskErrors {
         /// When, s.
         at: f64,
         /// Which robot.
         robot: String,
+        /// How many.
+        errors: u64,
+    },
+    /// The disk says that it synced, and does not; at the end the power goes.
+    LyingDisk {
+        /// Start, s.
+        at: f64,
+        /// Time until the power goes, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+    },
+    /// The process is killed, and its disk is what it was at `at`.
+    OldImage {
+        /// When the image was taken, s.
+        at: f64,
+        /// Time until it is put back, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+    },
+    /// Bits flip at rest; the process is killed to meet them.
+    FlipBits {
+        /// Start, s.
+        at: f64,
+        /// Time until it runs again, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+        /// How many.
+        bits: u64,
+    },
+    /// A second robot runs on a copy of this one's disk, with its key.
+    Twin {
+        /// Start, s.
+        at: f64,
+        /// Duration, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+    },
+    /// The robot's wall clock jumps.
+    ClockJump {
+        /// When, s.
+        at: f64,
+        /// Which robot.
+        robot: String,
+        /// By how much, s; a clock never shows less than 1970.
+        secs: f64,
+    },
+    /// A member that holds its key, but tells one half of the swarm another story than the other.
+    Equivocate {
+        /// Start, s.
+        at: f64,
+        /// Duration, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+    },
+    /// The robot's frames come in another version of the protocol.
+    OtherVersion {
+        /// Start, s.
+        at: f64,
+        /// Duration, s.
+        lasts: f64,
+        /// Which robot.
+        robot: String,
+    },
+    /// Somebody without a key shouts at a robot, under an id of its own each time.
+    Flood {
+        /// Start, s.
+        at: f64,
+        /// Duration, s.
+        lasts: f64,
+        /// Which robot hears it.
+        robot: String,
+        /// Messages a second.
+        per_sec: f64,
     },
     /// The robot is gone for good.
     Leave {
@@ -111,7 +210,17 @@ impl Fault {
             | Self::Wipe { at, .. }
             | Self::Pause { at, .. }
             | Self::NewFrame { at, .. }
+            | Self::PowerCut { at, .. }
             | Self::DiskFull { at, .. }
+            | Self::LyingDisk { at, .. }
+            | Self::OldImage { at, .. }
+            | Self::FlipBits { at, .. }
+            | Self::Twin { at, .. }
+            | Self::Equivocate { at, .. }
+            | Self::OtherVersion { at, .. }
+            | Self::Flood { at, .. }
+            | Self::DiskErrors { at, .. }
+            | Self::ClockJump { at, .. }
             | Self::Leave { at, .. } => at,
         }
     }
@@ -124,8 +233,17 @@ impl Fault {
             | Self::OneWay { at, lasts, .. }
             | Self::Kill { at, lasts, .. }
             | Self::Wipe { at, lasts, .. }
-            | Self::Pause { at, lasts, .. } => Some(at + lasts),
-            Self::NewFrame { .. } | Self::DiskFull { .. } | Self::Leave { .. } => None,
+            | Self::Pause { at, lasts, .. }
+            | Self::PowerCut { at, lasts, .. }
+            | Self::DiskFull { at, lasts, .. }
+            | Self::LyingDisk { at, lasts, .. }
+            | Self::OldImage { at, lasts, .. }
+            | Self::FlipBits { at, lasts, .. }
+            | Self::Twin { at, lasts, .. }
+            | Self::Equivocate { at, lasts, .. }
+            | Self::OtherVersion { at, lasts, .. }
+            | Self::Flood { at, lasts, .. } => Some(at + lasts),
+            Self::NewFrame { .. } | Self::DiskErrors { .. } | Self::ClockJump { .. } | Self::Leave { .. } => None,
         }
     }
 
@@ -139,7 +257,17 @@ impl Fault {
             | Self::Wipe { robot, .. }
             | Self::Pause { robot, .. }
             | Self::NewFrame { robot, .. }
+            | Self::PowerCut { robot, .. }
             | Self::DiskFull { robot, .. }
+            | Self::LyingDisk { robot, .. }
+            | Self::OldImage { robot, .. }
+            | Self::FlipBits { robot, .. }
+            | Self::Twin { robot, .. }
+            | Self::Equivocate { robot, .. }
+            | Self::OtherVersion { robot, .. }
+            | Self::Flood { robot, .. }
+            | Self::DiskErrors { robot, .. }
+            | Self::ClockJump { robot, .. }
             | Self::Leave { robot, .. } => vec![robot],
         }
     }
@@ -178,8 +306,52 @@ pub struct FaultCounts {
     pub delayed_by_pause: u64,
     /// New local frames.
     pub new_frames: u64,
-    /// Batches that the disk refused.
+    /// Power cuts.
+    pub power_cuts: u64,
+    /// Those in the middle of a commit.
+    pub cut_in_commit: u64,
+    /// Writes that a power cut lost.
+    pub writes_lost: u64,
+    /// Writes that a power cut tore.
+    pub writes_torn: u64,
+    /// Commits that the disk refused.
     pub disk_refused: u64,
+    /// Commits that it took after it had refused.
+    pub disk_healed: u64,
+    /// Syncs that lied.
+    pub syncs_lied: u64,
+    /// Old images put back.
+    pub old_images: u64,
+    /// Bits flipped at rest.
+    pub bits_flipped: u64,
+    /// Damaged records found by stores that were opened.
+    pub damage_found: u64,
+    /// Stores opened that may have lost an entry.
+    pub logs_closed: u64,
+    /// Stores that could not be opened for a while.
+    pub store_unusable: u64,
+    /// Stores beyond mending, moved away.
+    pub store_moved_away: u64,
+    /// Second robots with a key in use.
+    pub twins: u64,
+    /// Jumps of wall clocks.
+    pub clock_jumps: u64,
+    /// Second stories told.
+    pub equivocations: u64,
+    /// Frames sent in another version.
+    pub other_versions: u64,
+    /// Messages from nobody.
+    pub floods: u64,
+    /// Mangled copies delivered.
+    pub mangled: u64,
+    /// Old messages delivered once more.
+    pub replayed: u64,
+    /// False alignments computed by a liar.
+    pub lies: u64,
+    /// Logs found with two histories, over all robots.
+    pub forks: u64,
+    /// New epochs that robots began by themselves.
+    pub epochs_begun: u64,
     /// Robots gone for good.
     pub left: u64,
     /// Keyframes that came while the process was down.

@@ -4,6 +4,7 @@
 //! A run is a pure function of a [`scenario::Scenario`] and a seed: the same pair gives the same trace hash, bit for bit.
 //! First a storm (robots drive, faults rage), then calm: the network heals and the swarm must converge in a stated time.
 
+pub mod band;
 pub mod bar;
 pub mod bench;
 pub mod check;
@@ -19,4 +20,5 @@ pub mod stage;
 pub mod svg;
 pub mod swarm;
 pub mod truth;
+pub mod vopr;
 pub mod world;

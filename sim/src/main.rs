@@ -5,6 +5,7 @@
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 use merganser_protocol::agent::Agent;
+use merganser_sim::band::{Band, parse_band};
 use merganser_sim::bar::progress_bar;
 use merganser_sim::bench::{self, Bench};
 use merganser_sim::record::record;
@@ -12,6 +13,7 @@ use merganser_sim::report::Report;
 use merganser_sim::scenario::Scenario;
 use merganser_sim::svg::picture;
 use merganser_sim::swarm::{Outcome, Swarm};
+use merganser_sim::vopr::command::{self, VoprArgs};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -47,6 +49,8 @@ enum Command {
         #[arg(long)]
         twice: bool,
     },
+    /// Attack swarms: draw networks, machines and faults from seeds, and check every invariant
+    Vopr(VoprArgs),
     /// Write the demo's three recordings, the same bytes each time
     Record {
         /// Where the recordings' folders go
@@ -64,17 +68,6 @@ enum Command {
     Bench(Bench),
 }
 
-/// Seeds from the first up to, but without, the second.
-#[derive(Clone, Copy, Debug)]
-struct Band(u64, u64);
-
-fn parse_band(text: &str) -> Result<Band, String> {
-    let mend = || format!("{text:?} is no band of seeds: write 0..64");
-    let (first, end) = text.split_once("..").ok_or_else(mend)?;
-    let band = Band(first.parse().map_err(|_| mend())?, end.parse().map_err(|_| mend())?);
-    if band.0 < band.1 { Ok(band) } else { Err(mend()) }
-}
-
 fn main() -> ExitCode {
     match dispatch(Cli::parse().command) {
         Ok(true) => ExitCode::SUCCESS,
@@ -88,6 +81,7 @@ fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> anyhow::Result<bool> {
     match command {
+        Command::Vopr(args) => command::run(&args),
         Command::Bench(what) => bench::run(what),
         Command::Record { out, seed, scenario } => {
             let scenario = match scenario {
@@ -215,25 +209,10 @@ fn table(report: &Report) -> String {
         text +=
             &format!("{:<22} {:>8.4} {:>7.3} {:>9}\n", format!("{} -> {}", e.own, e.frame), e.metres, e.degrees, d2);
     }
-    let f = &report.faults;
-    text += &format!(
-        "\nfaults: {} lost, {} in bursts, {} doubled, {} reordered, {} blocked, {} over capacity, {} unanswered, {} \
-         killed, {} restarted, {} wiped, {} paused, {} disk refusals, {} new frames, {} left\n",
-        f.lost,
-        f.burst_lost,
-        f.duplicated,
-        f.reordered,
-        f.blocked,
-        f.over_capacity,
-        f.unanswered,
-        f.killed,
-        f.restarted,
-        f.wiped,
-        f.paused,
-        f.disk_refused,
-        f.new_frames,
-        f.left
-    );
+    let counts = serde_json::to_value(&report.faults).unwrap_or_default();
+    let fired = counts.as_object().into_iter().flatten().filter(|(_, count)| **count != 0);
+    let fired: Vec<String> = fired.map(|(name, count)| format!("{count} {}", name.replace('_', " "))).collect();
+    text += &format!("\nfaults: {}\n", fired.join(", "));
     text
 }
 

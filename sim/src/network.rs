@@ -34,6 +34,10 @@ pub struct NetworkOptions {
     pub reorder: f64,
     /// ...by up to this.
     pub reorder_ms_max: f64,
+    /// Share of messages of which a mangled copy arrives as well.
+    pub mangle: f64,
+    /// Share of messages that arrive once more, up to a minute later.
+    pub replay: f64,
     /// Capacity of each link; 0 is unlimited.
     pub bytes_per_sec: f64,
     /// A message that would wait longer than this for its link is dropped.
@@ -58,6 +62,8 @@ impl Default for NetworkOptions {
             duplicate: 0.0,
             reorder: 0.0,
             reorder_ms_max: 200.0,
+            mangle: 0.0,
+            replay: 0.0,
             bytes_per_sec: 0.0,
             queue_ms_max: 2000.0,
             answer_ms_max: 2000.0,
@@ -71,11 +77,20 @@ impl NetworkOptions {
     /// The same network after all faults have stopped: only latency is left.
     #[must_use]
     pub fn healed(&self) -> Self {
-        Self { loss: 0.0, bursts_per_min: 0.0, duplicate: 0.0, reorder: 0.0, bytes_per_sec: 0.0, ..self.clone() }
+        Self {
+            loss: 0.0,
+            bursts_per_min: 0.0,
+            duplicate: 0.0,
+            reorder: 0.0,
+            mangle: 0.0,
+            replay: 0.0,
+            bytes_per_sec: 0.0,
+            ..self.clone()
+        }
     }
 
     /// Every knob's key, value, bounds and remedy, for the scenario's check.
-    pub fn ranges(&self) -> [(&'static str, f64, f64, f64, &'static str); 14] {
+    pub fn ranges(&self) -> [(&'static str, f64, f64, f64, &'static str); 16] {
         let ms = "use 0 to 600000 ms";
         let share = "use a share from 0 to 1";
         [
@@ -88,6 +103,8 @@ impl NetworkOptions {
             ("network.duplicate", self.duplicate, 0.0, 1.0, share),
             ("network.reorder", self.reorder, 0.0, 1.0, share),
             ("network.reorder_ms_max", self.reorder_ms_max, 0.0, 600_000.0, ms),
+            ("network.mangle", self.mangle, 0.0, 1.0, share),
+            ("network.replay", self.replay, 0.0, 1.0, share),
             ("network.bytes_per_sec", self.bytes_per_sec, 0.0, 1e12, "use 0 (unlimited) to 1e12"),
             ("network.queue_ms_max", self.queue_ms_max, 0.0, 600_000.0, ms),
             ("network.answer_ms_max", self.answer_ms_max, 1.0, 600_000.0, "use 1 to 600000 ms"),
@@ -177,6 +194,31 @@ impl Network {
         let copies = if link.dice.chance(options.duplicate) { 2 } else { 1 };
         counts.duplicated += copies - 1;
         (0..copies).map(|_| sent.after(link.delay(options, counts))).collect()
+    }
+}
+
+/// What else becomes of a message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tampering {
+    /// A copy arrives that was changed; the number says how.
+    Mangled(Instant, u64),
+    /// It arrives once more.
+    Replayed(Instant),
+}
+
+impl Network {
+    /// Whether somebody tampers with a message that passed.
+    pub fn tamper(&mut self, now: Instant, from: usize, to: usize) -> Option<Tampering> {
+        let options = &self.options;
+        if (options.mangle <= 0.0 && options.replay <= 0.0) || !self.is_open(from, to) {
+            return None;
+        }
+        let dice = &mut self.links[from * self.robots + to].dice;
+        if dice.chance(options.mangle) {
+            let at = now.after(millis(dice.range(1.0, 500.0)));
+            return Some(Tampering::Mangled(at, dice.bits()));
+        }
+        dice.chance(options.replay).then(|| Tampering::Replayed(now.after(millis(dice.range(100.0, 60_000.0)))))
     }
 }
 

@@ -42,6 +42,9 @@ pub struct Scenario {
     /// What they see with.
     #[serde(default)]
     pub sensor: SensorOptions,
+    /// What takes the place of scans and their alignment, for runs that are about replication: none by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub summary: Option<SummaryOptions>,
     /// What lies between them.
     #[serde(default)]
     pub network: NetworkOptions,
@@ -73,11 +76,43 @@ pub struct MachineOptions {
     pub start_within_secs: f64,
     /// Robots' clocks (the stamps of their keyframes) differ by up to this, s.
     pub clock_offset_secs: f64,
+    /// A new store's epoch is the second that the wall clock shows, as in a real agent; else it counts starts.
+    pub wall_epochs: bool,
+}
+
+/// Summary level: no rays are cast and no clouds aligned. A scan is a handful of points, and an alignment is the truth
+/// with noise where two submaps lie within reach of each other.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SummaryOptions {
+    /// Points in a scan.
+    pub points: usize,
+    /// Anchors farther apart than this do not align, m.
+    pub reach_m: f64,
+    /// Standard deviation of an alignment, m and rad.
+    pub sigma: [f64; 2],
+    /// Whether the joint estimate is solved; else robots believe nothing about one another.
+    pub solve: bool,
+    /// Robots that state false alignments, each its own falsehood.
+    pub liars: Vec<String>,
+}
+
+impl Default for SummaryOptions {
+    fn default() -> Self {
+        Self { points: 24, reach_m: 6.0, sigma: [0.02, 0.005], solve: true, liars: Vec::new() }
+    }
 }
 
 impl Default for MachineOptions {
     fn default() -> Self {
-        Self { persist_ms: 20.0, workers: 2, slowness: 1.0, start_within_secs: 1.0, clock_offset_secs: 3600.0 }
+        Self {
+            persist_ms: 20.0,
+            workers: 2,
+            slowness: 1.0,
+            start_within_secs: 1.0,
+            clock_offset_secs: 3600.0,
+            wall_epochs: false,
+        }
     }
 }
 
@@ -148,6 +183,13 @@ impl Scenario {
         range("machine.slowness", m.slowness, 0.0, 1000.0, "use 0 to 1000")?;
         range("machine.start_within_secs", m.start_within_secs, 0.0, self.duration_secs, "use at most the duration")?;
         range("machine.clock_offset_secs", m.clock_offset_secs, 0.0, 1e9, "use 0 to 1e9 s")?;
+        if let Some(summary) = &self.summary {
+            range("summary.points", summary.points as f64, 12.0, 1000.0, "use 12 to 1000")?;
+            range("summary.reach_m", summary.reach_m, 0.0, 1e6, "use 0 to 1e6 m")?;
+            range("summary.sigma[0]", summary.sigma[0], 1e-6, 10.0, "use 1e-6 to 10 m")?;
+            range("summary.sigma[1]", summary.sigma[1], 1e-6, 1.0, "use 1e-6 to 1 rad")?;
+            summary.liars.iter().try_for_each(|liar| self.validate_name("summary.liars", liar))?;
+        }
         range("expect.error_max_m", self.expect.error_max_m, 1e-6, 1e6, "use a positive length")?;
         range("expect.error_max_deg", self.expect.error_max_deg, 1e-6, 180.0, "use 0 to 180 degrees")?;
         for (key, value, low, high, mend) in self.network.ranges() {
@@ -194,15 +236,18 @@ impl Scenario {
             let lasts = ends - fault.begins();
             range(&key("lasts"), lasts, 0.0, self.duration_secs - fault.begins(), "end it within duration_secs")?;
         }
-        let names = self.names();
-        match fault.robots().into_iter().find(|robot| !names.iter().any(|name| name == robot)) {
-            None => Ok(()),
-            Some(robot) => Err(ScenarioError::Value {
-                key: key("robot"),
-                value: format!("{robot:?}"),
-                mend: "name one of the scenario's robots: alpha, beta, gamma…",
-            }),
+        fault.robots().into_iter().try_for_each(|robot| self.validate_name(&key("robot"), robot))
+    }
+
+    fn validate_name(&self, key: &str, robot: &str) -> Result<(), ScenarioError> {
+        if self.names().iter().any(|name| name == robot) {
+            return Ok(());
         }
+        Err(ScenarioError::Value {
+            key: key.to_owned(),
+            value: format!("{robot:?}"),
+            mend: "name one of the scenario's robots: alpha, beta, gamma…",
+        })
     }
 }
 

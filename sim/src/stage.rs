@@ -17,6 +17,8 @@ pub struct Stage {
     names: Vec<String>,
     world: World,
     sensor: Sensor,
+    /// Points of a made-up scan, at summary level.
+    made_up: Option<usize>,
     steps: Vec<Vec<Step>>,
 }
 
@@ -46,7 +48,8 @@ impl Stage {
             drive(&scenario.drive, path, scenario.duration_secs, &mut dice)
         };
         let steps = paths.iter().enumerate().map(one).collect::<Result<_, _>>()?;
-        Ok(Self { seed, names: scenario.names(), world, sensor: Sensor::new(scenario.sensor.clone()), steps })
+        let made_up = scenario.summary.as_ref().map(|summary| summary.points);
+        Ok(Self { seed, names: scenario.names(), world, sensor: Sensor::new(scenario.sensor.clone()), made_up, steps })
     }
 
     /// The robots' names.
@@ -67,6 +70,9 @@ impl Stage {
     /// The points of one keyframe, body frame, m.
     pub fn scan(&self, robot: usize, index: usize) -> Vec<[f32; 3]> {
         let mut dice = Dice::new(self.seed, &format!("scan {robot} {index}"));
+        if let Some(points) = self.made_up {
+            return (0..points).map(|_| [0; 3].map(|_| dice.range(-1.5, 1.5) as f32)).collect();
+        }
         self.sensor.scan(&self.world, &self.steps[robot][index].t_world_body, &mut dice)
     }
 }

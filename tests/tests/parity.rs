@@ -9,7 +9,7 @@ use common::{keyframe, start, swarm, until};
 use merganser::commands::replay::replay;
 use merganser::host::Host;
 use merganser::journal::{Frame, Reader, StoredInput};
-use merganser::store::Store;
+use merganser::store;
 use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::{Command, Input};
 use merganser_protocol::snapshot::StatusView;
@@ -84,9 +84,7 @@ async fn a_restart_goes_on_with_the_same_log() {
     let ended = alpha.stop().await.unwrap();
 
     // What lies on the disk is enough for a core without any shell.
-    let store = Store::open(&configs[0].store.path, &configs[0].swarm, &configs[0].robot).unwrap();
-    let restored = store.load().unwrap();
-    drop(store);
+    let restored = store::open(&configs[0]).unwrap().restored;
     let identity = configs[0].identity().unwrap();
     let core = Agent::new(configs[0].core.clone(), identity, 1, restored, Instant::ZERO).unwrap();
     assert_eq!((core.digest(), core.status().entries), (ended.digest, before.entries));

@@ -4,6 +4,7 @@ pub mod check;
 pub mod keys;
 pub mod replay;
 pub mod run;
+pub mod store;
 pub mod watch;
 
 use anyhow::{Context, Result};

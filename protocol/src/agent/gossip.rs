@@ -191,6 +191,9 @@ impl Agent {
                     self.ingest(Some(from), &entry.0);
                 }
             }
+            (Channel::Have, Message::Have(_)) if self.replica.name_of(from).is_none() => {
+                self.reject(Some(from), "have: unknown robot", "the key names a robot that is not in the roster");
+            }
             (Channel::Have, Message::Have(have)) => {
                 self.gossip.spread.on_have(self.now, &self.replica, from, have);
             }

@@ -86,7 +86,8 @@ pub enum Input {
         /// The batch number.
         up_to: u64,
     },
-    /// The store could not write (disk full, I/O error): the agent stops writing facts and says so.
+    /// The store cannot write (disk full, I/O error) and goes on trying: until the next [`Input::Persisted`] the agent
+    /// begins nothing that would have to be written, and says so.
     PersistFailed {
         /// The first batch that is not durable.
         batch: u64,
@@ -198,6 +199,20 @@ pub enum Record {
         /// Encoded features and cloud.
         bytes: Vec<u8>,
     },
+    /// Proof that a log has two histories: two entries that contradict each other. Without it a restart would take the
+    /// log out of quarantine.
+    Fork {
+        /// The log.
+        frame: FrameId,
+        /// The canonical bytes of the two entries.
+        proof: [Vec<u8>; 2],
+    },
+    /// This robot's own epochs up to this one must not be continued, in no later run: a new one was begun, or entries
+    /// that others may hold were lost. The largest counts.
+    EpochClosed {
+        /// The last one closed.
+        epoch: u32,
+    },
 }
 
 /// Something people may want to know. Shells log it; tests assert on it.
@@ -255,11 +270,13 @@ pub enum Event {
         /// Refusals of the same peer not reported one by one.
         suppressed: u64,
     },
-    /// Storage failed; the agent no longer writes facts of its own.
+    /// Storage failed; until it works again the agent hears, solves and serves what is durable, and no more.
     ReceiveOnly {
         /// Why.
         reason: String,
     },
+    /// Storage works again; nothing was lost.
+    StoreHealed,
     /// A new epoch, hence a new frame, began.
     EpochBegan {
         /// Its frame.

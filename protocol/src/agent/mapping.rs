@@ -143,6 +143,9 @@ impl Agent {
 
     /// A direct measurement of another robot, carried from the two bodies to the anchors they are known by.
     pub(super) fn on_sighting(&mut self, sighting: &Sighting) {
+        if self.receive_only {
+            return self.reject(Some(self.me.robot), "sighting: store", "the store fails; it cannot be kept");
+        }
         match self.sighting_fact(sighting) {
             Ok(fact) => self.write(self.me.frame.epoch, &Fact::Sighting(fact)),
             Err(detail) => self.reject(Some(self.me.robot), "sighting", detail),

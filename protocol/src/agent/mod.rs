@@ -75,7 +75,8 @@ pub enum StartError {
 pub struct Restored {
     /// All durable records, in any order.
     pub records: Vec<Record>,
-    /// The epoch to begin if the store is empty: larger than any this robot used before (seconds since 2020 serve).
+    /// The epoch to begin if the store is empty or must not be continued: larger than any this robot used before
+    /// (seconds since 2020 serve).
     pub fresh_epoch: u32,
 }
 
@@ -205,6 +206,11 @@ impl Agent {
         self.me.frame
     }
 
+    /// What it holds: the lengths of its logs, `None` for those that have two histories.
+    pub fn heads(&self) -> impl Iterator<Item = (FrameId, Option<u32>)> {
+        self.replica.lengths()
+    }
+
     /// BLAKE3 digest of the set of durable entries held: equal sets, equal digests.
     pub fn digest(&self) -> Hash {
         self.replica.digest()
@@ -215,22 +221,33 @@ impl Agent {
     fn restore(&mut self, restored: Restored) {
         let mut entries = Vec::new();
         let mut private = Vec::new();
+        let mut forks = Vec::new();
+        let mut closed = None;
+        let fresh_epoch = restored.fresh_epoch;
         for record in restored.records {
             match record {
                 Record::Entry { bytes, .. } => entries.push(bytes),
                 Record::Blob { bytes, .. } => self.keep_blob(bytes),
                 Record::Private { submap, bytes } => private.push((submap, bytes)),
+                Record::Fork { proof, .. } => forks.push(proof),
+                Record::EpochClosed { epoch } => closed = closed.max(Some(epoch)),
             }
         }
         let loaded = self.replica.restore(entries);
+        for [a, b] in forks {
+            if let Err(error) = self.replica.ingest_fork(&a, &b) {
+                self.reject(None, "store: fork", &error.to_string());
+            }
+        }
         if let Some(epoch) = self.replica.epochs_of(self.me.robot).next_back() {
             self.me.frame.epoch = epoch;
         }
         if let Err(damage) = loaded {
             self.reject(None, "store", &damage.to_string());
-            if damage.concerns(self.me.frame) {
-                self.begin_epoch(self.me.frame.epoch.saturating_add(1));
-            }
+            closed = closed.max(damage.concerns(self.me.frame).then_some(self.me.frame.epoch));
+        }
+        if let Some(closed) = closed.filter(|closed| *closed >= self.me.frame.epoch) {
+            self.begin_epoch(closed.saturating_add(1).max(fresh_epoch));
         }
         self.relearn();
         for (submap, bytes) in private {
@@ -239,11 +256,9 @@ impl Agent {
         self.resume_mapping();
     }
 
-    /// Writes a fact of our own; it takes effect once it is durable.
+    /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
+    /// here; what was under way waits for the disk with the rest.
     fn write(&mut self, epoch: u32, fact: &Fact) {
-        if self.receive_only {
-            return;
-        }
         match self.replica.append(&self.me.key, epoch, fact) {
             Ok(entry) => self.ledger.open.push(Record::Entry { id: entry.id(), bytes: entry.encode() }),
             Err(error) => {
@@ -269,7 +284,7 @@ impl Agent {
             Ok(Ingested::Known | Ingested::Early(_)) => {}
             Err(error @ IngestError::Fork(frame)) => {
                 self.reject(Some(frame.robot), error.reason(), &error.to_string());
-                self.gossip.spread.on_news(self.now, 1);
+                self.keep_proof(frame);
                 self.relearn();
                 return true;
             }
@@ -283,7 +298,7 @@ impl Agent {
         match self.replica.ingest_fork(&a.0, &b.0) {
             Ok((frame, true)) => {
                 self.reject(Some(frame.robot), "fork", &format!("log {frame} has two histories; it is quarantined"));
-                self.gossip.spread.on_news(self.now, 1);
+                self.keep_proof(frame);
                 self.relearn();
                 return true;
             }
@@ -293,6 +308,14 @@ impl Agent {
         false
     }
 
+    /// A log that is in quarantine stays there over restarts.
+    fn keep_proof(&mut self, frame: FrameId) {
+        self.gossip.spread.on_news(self.now, 1);
+        let proof = self.replica.forks().find(|(forked, _)| *forked == frame);
+        let proof = proof.map(|(_, proof)| [proof.a.clone(), proof.b.clone()]);
+        self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
+    }
+
     /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide.
     fn meet_own_past(&mut self, id: EntryId) {
         if id.frame.robot == self.me.robot && id.frame.epoch >= self.me.frame.epoch {
@@ -300,10 +323,12 @@ impl Agent {
         }
     }
 
-    /// A new local frame begins: the trajectory so far is closed.
+    /// A new local frame begins: the trajectory so far is closed, for later runs as well, even if this one ends before
+    /// the new epoch has an entry.
     fn begin_epoch(&mut self, epoch: u32) {
         self.close_submap();
         self.me.frame.epoch = epoch;
+        self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
         self.mapper.restart(&self.config.submap);
         self.event(Event::EpochBegan { frame: self.me.frame });
     }
@@ -325,6 +350,10 @@ impl Agent {
     fn on_persisted(&mut self, up_to: u64) {
         let later = self.ledger.waiting.split_off(&up_to.saturating_add(1));
         let durable = core::mem::replace(&mut self.ledger.waiting, later);
+        if core::mem::take(&mut self.receive_only) {
+            self.negotiation.stir();
+            self.event(Event::StoreHealed);
+        }
         let mut own = Vec::new();
         let durable: Vec<EntryId> = durable.into_values().flatten().collect();
         self.gossip.spread.on_news(self.now, durable.len());

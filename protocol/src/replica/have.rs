@@ -147,6 +147,11 @@ impl Replica {
         have.heads().filter_map(ahead).collect()
     }
 
+    /// Durable entries of every log that has any; `None` for those in quarantine.
+    pub fn lengths(&self) -> impl Iterator<Item = (FrameId, Option<u32>)> {
+        self.durable_heads().map(|(frame, head)| (frame, head.map(|(len, _)| len)))
+    }
+
     fn vector(&self, asker: RobotId, listed: bool, heads: &[(FrameId, Head)]) -> HaveVector {
         let robots: Vec<RobotId> = if listed {
             let mut robots: Vec<RobotId> = heads.iter().map(|(frame, _)| frame.robot).chain([asker]).collect();

@@ -4,7 +4,7 @@
 
 use super::{Check, Seen};
 use merganser_protocol::agent::io::{Output, Record};
-use merganser_protocol::ids::Hash;
+use merganser_protocol::ids::{Hash, RobotId};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Messages remembered per robot, to be held against records that come later.
@@ -15,6 +15,9 @@ const RECORD_LEN_MIN: usize = 24;
 /// See the module.
 #[derive(Debug, Default)]
 pub struct DurableFirst {
+    /// Robots whose logs may have two histories. The proof of a fork travels at once, with entries that are not stored:
+    /// it is no claim to hold them.
+    doubted: BTreeSet<RobotId>,
     robots: BTreeMap<usize, Robot>,
 }
 
@@ -40,6 +43,9 @@ impl Check for DurableFirst {
                 state.sent.clear();
             }
             Seen::Wiped => state.durable.clear(),
+            Seen::MayFork(origin) => {
+                self.doubted.insert(*origin);
+            }
             Seen::Durable(batch) => {
                 while state.waiting.front().is_some_and(|(number, _)| number <= batch) {
                     let records = state.waiting.pop_front().map(|(_, records)| records).unwrap_or_default();
@@ -48,7 +54,8 @@ impl Check for DurableFirst {
             }
             Seen::Output(Output::Persist { batch, records }) => {
                 let new = |bytes: &Vec<u8>| !state.durable.contains(&Hash::of(bytes));
-                let needles: Vec<Vec<u8>> = records.iter().filter_map(sendable).filter(new).collect();
+                let needles: Vec<Vec<u8>> =
+                    records.iter().filter_map(|r| sendable(r, &self.doubted)).filter(new).collect();
                 if let Some(needle) = needles.iter().find(|n| state.sent.iter().any(|message| contains(message, n))) {
                     return Err(format!("robot {robot}: sent {} B before it stored them", needle.len()));
                 }
@@ -75,12 +82,13 @@ impl Check for DurableFirst {
     }
 }
 
-fn sendable(record: &Record) -> Option<Vec<u8>> {
+fn sendable(record: &Record, doubted: &BTreeSet<RobotId>) -> Option<Vec<u8>> {
     match record {
+        Record::Entry { id, .. } if doubted.contains(&id.frame.robot) => None,
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } => {
             (bytes.len() >= RECORD_LEN_MIN).then(|| bytes.clone())
         }
-        Record::Private { .. } => None,
+        Record::Private { .. } | Record::Fork { .. } | Record::EpochClosed { .. } => None,
     }
 }
 

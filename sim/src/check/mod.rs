@@ -1,11 +1,14 @@
 //! The invariants, a file each (DESIGN §8). A check watches every output as it happens and samples of the whole swarm
 //! now and then; the first one that objects ends the run. Each file ends with a test that its check bites.
 
+mod bounded;
+mod closed;
 mod contract;
 mod converged;
 mod durable_first;
 mod honest_covariance;
 mod merged_as_expected;
+mod never_back;
 mod no_false_merge;
 mod same_estimate;
 mod same_facts;
@@ -15,7 +18,7 @@ mod unique_entries;
 use crate::scenario::Expect;
 use merganser_protocol::agent::io::Output;
 use merganser_protocol::geometry::Se3;
-use merganser_protocol::ids::Hash;
+use merganser_protocol::ids::{FrameId, Hash, RobotId};
 use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::time::Instant;
 use serde::Serialize;
@@ -58,6 +61,10 @@ pub enum Seen<'a> {
     Died,
     /// Its disk was replaced by an empty one.
     Wiped,
+    /// Its disk lost something that it had confirmed: bits flipped, it lied, or an old image was put on it.
+    Damaged,
+    /// From now on there may be two histories of this robot's logs, by no fault of the core.
+    MayFork(RobotId),
 }
 
 /// Where in the run a sample was taken.
@@ -87,10 +94,16 @@ pub struct Sample<'a> {
 /// One running robot.
 #[derive(Clone, Debug)]
 pub struct RobotSample {
+    /// Its number.
+    pub index: usize,
     /// Its name.
     pub name: String,
     /// Digest of the facts it holds.
     pub digest: Hash,
+    /// Lengths of the logs it holds; `None` for those with two histories.
+    pub logs: BTreeMap<FrameId, Option<u32>>,
+    /// Size of its store's file.
+    pub disk_bytes: u64,
     /// What it believes.
     pub snapshot: Option<Snapshot>,
 }
@@ -116,6 +129,9 @@ impl Checks {
             Box::<contract::Contract>::default(),
             Box::<durable_first::DurableFirst>::default(),
             Box::<unique_entries::UniqueEntries>::default(),
+            Box::<never_back::NeverBack>::default(),
+            Box::<closed::Closed>::default(),
+            Box::<bounded::Bounded>::default(),
             Box::new(same_facts::SameFacts),
             Box::new(same_estimate::SameEstimate),
             Box::new(sound_numbers::SoundNumbers),
@@ -193,7 +209,14 @@ pub(crate) mod tests {
             graph: GraphView { nodes: 0, chi2: 0.0, dof: 0, edges: Vec::new() },
             stats: StatsView::default(),
         };
-        RobotSample { name: name.into(), digest: Hash([digest; 32]), snapshot: Some(snapshot) }
+        RobotSample {
+            index: 0,
+            name: name.into(),
+            digest: Hash([digest; 32]),
+            logs: BTreeMap::new(),
+            disk_bytes: 0,
+            snapshot: Some(snapshot),
+        }
     }
 
     /// A last sample of these robots.

@@ -4,8 +4,8 @@
 
 use super::{Check, Seen};
 use merganser_protocol::agent::io::{Output, Record};
-use merganser_protocol::ids::{EntryId, Hash};
-use std::collections::BTreeMap;
+use merganser_protocol::ids::{EntryId, Hash, RobotId};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// See the module.
 #[derive(Debug, Default)]
@@ -13,6 +13,9 @@ pub struct UniqueEntries {
     entries: BTreeMap<EntryId, Hash>,
     /// Handed to each robot's disk, by batch.
     waiting: BTreeMap<usize, Vec<(u64, EntryId, Hash)>>,
+    /// Robots whose keys or disks tell two stories through no fault of the core's. What becomes of these is the
+    /// business of convergence: a log with two histories is quarantined on all robots alike.
+    doubted: BTreeSet<RobotId>,
 }
 
 impl Check for UniqueEntries {
@@ -39,12 +42,16 @@ impl Check for UniqueEntries {
                 *waiting = later;
                 let durable: Vec<(u64, EntryId, Hash)> = durable;
                 for (_, id, hash) in durable {
-                    if *self.entries.entry(id).or_insert(hash) != hash {
+                    let doubted = self.doubted.contains(&id.frame.robot);
+                    if *self.entries.entry(id).or_insert(hash) != hash && !doubted {
                         return Err(format!("robot {robot}: a second content for entry {id}"));
                     }
                 }
             }
             Seen::Died => waiting.clear(),
+            Seen::MayFork(origin) => {
+                self.doubted.insert(*origin);
+            }
             _ => {}
         }
         Ok(())
@@ -82,6 +89,16 @@ mod tests {
         assert!(check.see(0, &Seen::Died).is_ok());
         assert!(store(&mut check, 0, &entry(0, 2)).is_ok());
         assert!(store(&mut check, 1, &entry(0, 1)).is_err(), "unless somebody else holds it");
+    }
+
+    #[test]
+    fn whose_disk_was_put_back_is_excused_and_nobody_else() {
+        let mut check = UniqueEntries::default();
+        assert!(store(&mut check, 0, &entry(0, 1)).is_ok());
+        assert!(check.see(0, &Seen::MayFork(RobotId([2; 8]))).is_ok());
+        assert!(store(&mut check, 1, &entry(0, 2)).is_err());
+        assert!(check.see(0, &Seen::MayFork(RobotId([1; 8]))).is_ok());
+        assert!(store(&mut check, 1, &entry(0, 2)).is_ok());
     }
 
     #[test]

@@ -1,17 +1,61 @@
 //! The shell's part of a robot: events become inputs, outputs become events.
 
 use super::robot::{Asked, job_nanos};
-use super::{Event, OUTPUTS_MAX, Swarm, TOLD_MAX};
+use super::store::Committed;
+use super::{Event, OUTPUTS_MAX, Swarm, TOLD_MAX, Told, hostile};
 use crate::check::Seen;
 use crate::core::Core;
-use crate::network::millis;
+use crate::network::{Tampering, millis};
+use crate::world::drive::Step;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, Output, QueryKind};
+use merganser_protocol::agent::job::{Job, JobResult};
+use merganser_protocol::geometry::Se3;
 use merganser_protocol::time::Instant;
 
 /// A timeout is never nearer than this, so that virtual time moves even under a core that is always due.
 const WAKE_NANOS_MIN: u64 = 1_000;
 
 impl<C: Core> Swarm<C> {
+    fn publish(&mut self, now: Instant, robot: usize, channel: Channel, bytes: Vec<u8>) {
+        let bytes = self.in_its_version(robot, bytes);
+        self.robots[robot].count(channel_name(channel), bytes.len());
+        let one = &self.robots[robot];
+        let tells_two = one.equivocates && channel == Channel::Facts;
+        let other = tells_two.then(|| hostile::second_story(&bytes, &one.identity.secret_key)).flatten();
+        self.counts.equivocations += u64::from(other.is_some());
+        for to in (0..self.robots.len()).filter(|&to| to != robot) {
+            let bytes = other.as_ref().filter(|_| to % 2 == 1).unwrap_or(&bytes);
+            for at in self.network.send(now, robot, to, bytes.len(), &mut self.counts) {
+                self.queue.push(at, Event::Broadcast { from: robot, to, channel, bytes: bytes.clone() });
+            }
+            if let Some((at, bytes)) = self.tamper(now, robot, to, bytes) {
+                self.queue.push(at, Event::Broadcast { from: robot, to, channel, bytes });
+            }
+        }
+    }
+
+    /// What else of this message arrives, and when.
+    fn tamper(&mut self, now: Instant, from: usize, to: usize, bytes: &[u8]) -> Option<(Instant, Vec<u8>)> {
+        match self.network.tamper(now, from, to)? {
+            Tampering::Mangled(at, how) => {
+                self.counts.mangled += 1;
+                Some((at, hostile::mangle(bytes, how)))
+            }
+            Tampering::Replayed(at) => {
+                self.counts.replayed += 1;
+                Some((at, bytes.to_vec()))
+            }
+        }
+    }
+
+    fn in_its_version(&mut self, robot: usize, bytes: Vec<u8>) -> Vec<u8> {
+        if !self.robots[robot].other_version {
+            return bytes;
+        }
+        self.counts.other_versions += 1;
+        hostile::of_next_version(bytes)
+    }
+
     /// Turns an event into the input it is.
     pub(super) fn deliver(&mut self, now: Instant, event: Event) {
         match event {
@@ -42,17 +86,10 @@ impl<C: Core> Swarm<C> {
                     self.feed(now, to, Input::Answered { query, bytes });
                 }
             }
-            Event::Durable { robot, incarnation, batch } if self.runs(robot, incarnation) => {
-                self.robots[robot].store.commit(batch);
-                self.see(robot, &Seen::Durable(batch));
-                self.feed(now, robot, Input::Persisted { up_to: batch });
-            }
-            Event::DiskRefuses { robot, incarnation, batch } if self.runs(robot, incarnation) => {
-                self.counts.disk_refused += 1;
-                self.feed(now, robot, Input::PersistFailed { batch, reason: "no space left on device".to_owned() });
-            }
+            Event::Commit { robot, incarnation } if self.runs(robot, incarnation) => self.commit(now, robot),
+            Event::CutNow { robot, incarnation } if self.runs(robot, incarnation) => self.cut(now, robot),
             Event::JobDone { robot, incarnation, id, job } if self.runs(robot, incarnation) => {
-                let result = self.stopwatch.time(job.kind(), || job.run());
+                let result = self.work(robot, *job);
                 self.feed(now, robot, Input::JobDone { job: id, result });
             }
             Event::Wake { robot, incarnation, at }
@@ -78,15 +115,75 @@ impl<C: Core> Swarm<C> {
         self.robots[robot].core.is_some() && self.robots[robot].incarnation == incarnation
     }
 
+    fn commit(&mut self, now: Instant, robot: usize) {
+        let store = &mut self.robots[robot].store;
+        store.busy = false;
+        match self.stopwatch.time("commit", || store.commit()) {
+            Committed::Nothing => {}
+            Committed::Durable(up_to, healed) => {
+                self.counts.disk_healed += u64::from(healed);
+                self.see(robot, &Seen::Durable(up_to));
+                self.feed(now, robot, Input::Persisted { up_to });
+            }
+            Committed::Refused(batch, reason, news, pause) => {
+                self.counts.disk_refused += 1;
+                self.robots[robot].store.busy = true;
+                let incarnation = self.robots[robot].incarnation;
+                self.queue.push(now.after(pause), Event::Commit { robot, incarnation });
+                if news {
+                    self.feed(now, robot, Input::PersistFailed { batch, reason });
+                }
+            }
+            Committed::Conflict(what) => self.object("unique entries", format!("robot {robot}: {what}")),
+            Committed::PowerGone => {
+                self.counts.cut_in_commit += 1;
+                self.cut(now, robot);
+            }
+        }
+    }
+
+    /// Does heavy work, or what stands for it.
+    fn work(&mut self, robot: usize, job: Job) -> JobResult {
+        let drive = self.drives(robot);
+        let Some(standin) = &mut self.standin else {
+            return self.stopwatch.time(job.kind(), || job.run());
+        };
+        let (one, steps) = (&self.robots[robot], self.stage.steps(drive));
+        let locate = |t_frame_anchor: &Se3| {
+            let apart = |step: &&Step| (one.slam.t_frame_body(step).translation - t_frame_anchor.translation).norm();
+            let nearest = steps.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))?;
+            Some(nearest.t_world_body)
+        };
+        let kind = job.kind();
+        let (result, lied) = self.stopwatch.time(kind, || standin.run(one.name.as_str(), job, locate));
+        self.counts.lies += u64::from(lied);
+        result
+    }
+
+    /// Whose drive a robot is on: its own, or that of the robot it is the twin of.
+    fn drives(&self, robot: usize) -> usize {
+        self.ids.get(&self.robots[robot].id).copied().unwrap_or(robot)
+    }
+
+    /// A robot's SLAM finished a keyframe, and so does that of its twin.
     fn keyframe(&mut self, now: Instant, robot: usize, index: usize) {
-        let step = &self.stage.steps(robot)[index];
+        self.keyframe_of(now, robot, robot, index);
+        for twin in self.stage.names().len()..self.robots.len() {
+            if self.robots[twin].core.is_some() && self.drives(twin) == robot {
+                self.keyframe_of(now, twin, robot, index);
+            }
+        }
+    }
+
+    fn keyframe_of(&mut self, now: Instant, robot: usize, drive: usize, index: usize) {
+        let step = &self.stage.steps(drive)[index];
         let one = &mut self.robots[robot];
         if one.core.is_none() {
             one.slam.skip(step);
             self.counts.keyframes_missed += 1;
             return;
         }
-        let points = self.stopwatch.time("scan", || self.stage.scan(robot, index));
+        let points = self.stopwatch.time("scan", || self.stage.scan(drive, index));
         let keyframe = match one.slam.keyframe(step, points) {
             Ok(keyframe) => keyframe,
             Err(error) => return self.object("stage", error.to_string()),
@@ -142,23 +239,17 @@ impl<C: Core> Swarm<C> {
         let incarnation = self.robots[robot].incarnation;
         match output {
             Output::Persist { batch, records } => {
-                let at = now.after(millis(self.scenario.machine.persist_ms));
-                if self.robots[robot].disk_full {
-                    self.queue.push(at, Event::DiskRefuses { robot, incarnation, batch });
-                } else {
-                    self.robots[robot].store.accept(batch, records);
-                    self.queue.push(at, Event::Durable { robot, incarnation, batch });
+                let store = &mut self.robots[robot].store;
+                store.accept(batch, records);
+                // What comes while a commit is on its way shares it.
+                if !core::mem::replace(&mut store.busy, true) {
+                    let at = now.after(millis(self.scenario.machine.persist_ms));
+                    self.queue.push(at, Event::Commit { robot, incarnation });
                 }
             }
-            Output::Publish { channel, bytes } => {
-                self.robots[robot].count(channel_name(channel), bytes.len());
-                for to in (0..self.robots.len()).filter(|&to| to != robot) {
-                    for at in self.network.send(now, robot, to, bytes.len(), &mut self.counts) {
-                        self.queue.push(at, Event::Broadcast { from: robot, to, channel, bytes: bytes.clone() });
-                    }
-                }
-            }
+            Output::Publish { channel, bytes } => self.publish(now, robot, channel, bytes),
             Output::Ask { query, peer, kind, bytes } => {
+                let bytes = self.in_its_version(robot, bytes);
                 let one = &mut self.robots[robot];
                 one.count(ask_name(kind), bytes.len());
                 one.questions.insert(query);
@@ -171,13 +262,23 @@ impl<C: Core> Swarm<C> {
                     self.queue
                         .push(at, Event::Ask { from: robot, from_incarnation: incarnation, to, query, kind, bytes });
                 }
+                if let Some((at, bytes)) = self.tamper(now, robot, to, &bytes) {
+                    self.queue
+                        .push(at, Event::Ask { from: robot, from_incarnation: incarnation, to, query, kind, bytes });
+                }
                 let deadline = now.after(millis(self.network.options().answer_ms_max));
                 self.queue.push(deadline, Event::Answer { to: robot, incarnation, query, bytes: None });
             }
             Output::Answer { token, bytes } => {
                 // One that nobody asked for is the contract check's business.
                 let Some(asked) = self.robots[robot].asked.remove(&token.0) else { return };
+                let bytes = self.in_its_version(robot, bytes);
                 self.robots[robot].count(asked.kind, bytes.len());
+                // The first to come counts: a mangled one may be it.
+                if let Some((at, bytes)) = self.tamper(now, robot, asked.from, &bytes) {
+                    let (to, incarnation, query) = (asked.from, asked.incarnation, asked.query);
+                    self.queue.push(at, Event::Answer { to, incarnation, query, bytes: Some(bytes) });
+                }
                 for at in self.network.send(now, robot, asked.from, bytes.len(), &mut self.counts) {
                     let answer = Event::Answer {
                         to: asked.from,
@@ -194,12 +295,19 @@ impl<C: Core> Swarm<C> {
                 self.queue.push(at, Event::JobDone { robot, incarnation, id, job: Box::new(job) });
             }
             Output::Event(event) => {
+                self.counts.epochs_begun += u64::from(matches!(event, Told::EpochBegan { .. }));
+                self.counts.forks += u64::from(is_fork(&event));
                 if self.told.len() < TOLD_MAX {
                     self.told.push((now.as_secs_f64(), robot, event));
                 }
             }
         }
     }
+}
+
+/// A robot learned that a log has two histories.
+fn is_fork(event: &Told) -> bool {
+    matches!(event, Told::Rejected { reason, .. } if reason.contains("two histories"))
 }
 
 fn channel_name(channel: Channel) -> &'static str {

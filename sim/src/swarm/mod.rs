@@ -5,7 +5,11 @@
 mod act;
 #[cfg(test)]
 mod fake;
+mod fate;
+mod hostile;
+mod look;
 mod robot;
+mod standin;
 mod stopwatch;
 mod store;
 mod trace;
@@ -13,22 +17,22 @@ mod trace;
 pub use robot::Usage;
 pub use stopwatch::Stopwatch;
 
-use crate::check::{Checks, Phase, RobotSample, Sample, Seen, Violation};
+use crate::check::{Checks, Phase, RobotSample, Sample, Violation};
 use crate::core::Core;
 use crate::dice::Dice;
-use crate::faults::{Fault, FaultCounts};
+use crate::faults::FaultCounts;
 use crate::network::{Network, millis};
 use crate::queue::Queue;
 use crate::scenario::Scenario;
 use crate::stage::{Stage, StageError};
-use merganser_protocol::agent::io::{Channel, Command, Event as Told, Input, JobId, QueryId, QueryKind};
+use merganser_protocol::agent::StartError;
+use merganser_protocol::agent::io::{Channel, Event as Told, JobId, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
-use merganser_protocol::agent::{Restored, StartError};
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::ids::{NameError, RobotId};
-use merganser_protocol::snapshot::SubmapView;
 use merganser_protocol::time::Instant;
-use robot::{Robot, Slam, identities};
+use robot::{Hearing, Robot, Slam, identities};
+use standin::StandIn;
 use std::collections::BTreeMap;
 use thiserror::Error;
 use trace::Trace;
@@ -65,6 +69,7 @@ pub struct Swarm<C> {
     robots: Vec<Robot<C>>,
     ids: BTreeMap<RobotId, usize>,
     checks: Checks,
+    standin: Option<StandIn>,
     trace: Trace,
     counts: FaultCounts,
     truth: BTreeMap<String, Se3>,
@@ -73,6 +78,7 @@ pub struct Swarm<C> {
     violation: Option<Violation>,
     healed: bool,
     done_samples: u32,
+    agreed_since: Option<Instant>,
     events: u64,
     /// The virtual second that events are being counted in, and how many it has had.
     second: (u64, u64),
@@ -94,6 +100,8 @@ pub struct Outcome<C> {
     pub trace_lines: u64,
     /// Virtual time at the end.
     pub ended: Instant,
+    /// Since when all hold the same facts, as sampled after the healing.
+    pub agreed_since: Option<Instant>,
     /// Whether all held the same facts and had nothing left to do when it ended.
     pub idle: bool,
     /// Events handled.
@@ -121,13 +129,14 @@ enum Event {
     Broadcast { from: usize, to: usize, channel: Channel, bytes: Vec<u8> },
     Ask { from: usize, from_incarnation: u32, to: usize, query: QueryId, kind: QueryKind, bytes: Vec<u8> },
     Answer { to: usize, incarnation: u32, query: QueryId, bytes: Option<Vec<u8>> },
-    Durable { robot: usize, incarnation: u32, batch: u64 },
-    DiskRefuses { robot: usize, incarnation: u32, batch: u64 },
+    Commit { robot: usize, incarnation: u32 },
+    CutNow { robot: usize, incarnation: u32 },
     JobDone { robot: usize, incarnation: u32, id: JobId, job: Box<Job> },
     Wake { robot: usize, incarnation: u32, at: Instant },
     Hear { observer: usize, subject: usize, version: u64 },
     FaultBegins(usize),
     FaultEnds(usize),
+    Flood(usize),
     Heal,
     Sample,
 }
@@ -157,6 +166,10 @@ impl<C: Core> Swarm<C> {
                 }
             }
         }
+        let members = robots.len();
+        Self::with_twins(&mut robots, &scenario);
+        let all = robots.len();
+        robots.iter_mut().for_each(|robot| robot.hears.resize(all, Hearing::default()));
         for (index, fault) in scenario.faults.iter().enumerate() {
             queue.push(secs(fault.begins()), Event::FaultBegins(index));
             if let Some(ends) = fault.ends() {
@@ -166,8 +179,9 @@ impl<C: Core> Swarm<C> {
         queue.push(secs(scenario.duration_secs + scenario.machine.start_within_secs), Event::Heal);
         queue.push(secs(1.0), Event::Sample);
         Ok(Self {
-            network: Network::new(scenario.network.clone(), scenario.robots, seed),
-            ids: robots.iter().enumerate().map(|(index, robot)| (robot.id, index)).collect(),
+            network: Network::new(scenario.network.clone(), robots.len(), seed),
+            ids: robots.iter().take(members).enumerate().map(|(index, robot)| (robot.id, index)).collect(),
+            standin: scenario.summary.clone().map(|options| StandIn::new(options, seed)),
             scenario,
             stage,
             seed,
@@ -182,6 +196,7 @@ impl<C: Core> Swarm<C> {
             violation: None,
             healed: false,
             done_samples: 0,
+            agreed_since: None,
             events: 0,
             second: (0, 0),
         })
@@ -232,6 +247,7 @@ impl<C: Core> Swarm<C> {
             trace: self.trace.hash(),
             trace_lines: self.trace.lines(),
             ended,
+            agreed_since: self.agreed_since,
             idle: all_done(&robots),
             events: self.events,
             counts: self.counts,
@@ -277,200 +293,14 @@ impl<C: Core> Swarm<C> {
             Event::FaultEnds(index) => self.fault_ends(now, index)?,
             Event::Heal => self.heal(now)?,
             Event::Sample => self.sample(now),
+            Event::Flood(index) => self.flood(now, index),
             other => self.deliver(now, other),
         }
         Ok(())
     }
 
-    fn boot(&mut self, now: Instant, index: usize) -> Result<(), SwarmError> {
-        let robot = &mut self.robots[index];
-        if robot.core.is_some() || robot.gone {
-            return Ok(());
-        }
-        robot.incarnation += 1;
-        robot.booted = now;
-        let restored = Restored { records: robot.store.records(), fresh_epoch: robot.incarnation };
-        let seed = Dice::new(self.seed, &format!("agent {index} {}", robot.incarnation)).bits();
-        let core = C::start(self.scenario.config.clone(), robot.identity.clone(), seed, restored, robot.local(now))
-            .map_err(|error| SwarmError::Start(robot.name.to_string(), error))?;
-        robot.core = Some(core);
-        self.trace.note(now, index, "boot");
-        self.see(index, &Seen::Started);
-        self.counts.restarted += u64::from(self.robots[index].incarnation > 1);
-        self.drain(now, index);
-        self.update_hearing(now);
-        Ok(())
-    }
-
-    fn kill(&mut self, now: Instant, index: usize) {
-        let robot = &mut self.robots[index];
-        if robot.core.is_none() {
-            return;
-        }
-        robot.forget(now);
-        self.counts.records_lost += robot.store.crash() as u64;
-        self.counts.killed += 1;
-        self.trace.note(now, index, "kill");
-        self.see(index, &Seen::Died);
-        self.update_hearing(now);
-    }
-
-    fn fault_begins(&mut self, now: Instant, index: usize) {
-        let fault = self.scenario.faults[index].clone();
-        match &fault {
-            Fault::Partition { .. } | Fault::Isolate { .. } | Fault::OneWay { .. } => self.block(now, &fault, true),
-            Fault::Kill { robot, .. } => self.with(robot, |swarm, robot| swarm.kill(now, robot)),
-            Fault::Wipe { robot, .. } => self.with(robot, |swarm, robot| {
-                swarm.kill(now, robot);
-                swarm.robots[robot].store.wipe();
-                swarm.counts.wiped += 1;
-                swarm.see(robot, &Seen::Wiped);
-            }),
-            Fault::Pause { robot, lasts, .. } => self.with(robot, |swarm, robot| {
-                swarm.robots[robot].paused_until = now.after(millis(1e3 * lasts));
-                swarm.counts.paused += 1;
-                swarm.update_hearing(now);
-            }),
-            Fault::NewFrame { robot, .. } => self.with(robot, |swarm, robot| {
-                swarm.robots[robot].slam.restart();
-                swarm.counts.new_frames += 1;
-                swarm.feed(now, robot, Input::Command(Command::NewEpoch));
-            }),
-            Fault::DiskFull { robot, .. } => self.with(robot, |swarm, robot| swarm.robots[robot].disk_full = true),
-            Fault::Leave { robot, .. } => self.with(robot, |swarm, robot| {
-                swarm.kill(now, robot);
-                swarm.robots[robot].gone = true;
-                swarm.counts.left += 1;
-            }),
-        }
-    }
-
-    fn fault_ends(&mut self, now: Instant, index: usize) -> Result<(), SwarmError> {
-        let fault = self.scenario.faults[index].clone();
-        match &fault {
-            // The healing may have come first.
-            Fault::Partition { .. } | Fault::Isolate { .. } | Fault::OneWay { .. } if !self.healed => {
-                self.block(now, &fault, false);
-            }
-            Fault::Kill { robot, .. } | Fault::Wipe { robot, .. } => {
-                if let Some(robot) = self.find(robot) {
-                    self.robots[robot].disk_full = false;
-                    self.boot(now, robot)?;
-                }
-            }
-            Fault::Pause { .. } => self.update_hearing(now),
-            _ => {}
-        }
-        Ok(())
-    }
-
-    /// All faults stop. A robot whose disk was full gets room, and a restart.
-    fn heal(&mut self, now: Instant) -> Result<(), SwarmError> {
-        self.healed = true;
-        self.network.heal();
-        for robot in 0..self.robots.len() {
-            if core::mem::take(&mut self.robots[robot].disk_full) {
-                self.kill(now, robot);
-            }
-            self.boot(now, robot)?;
-        }
-        self.update_hearing(now);
-        Ok(())
-    }
-
-    fn block(&mut self, now: Instant, fault: &Fault, blocked: bool) {
-        let n = self.robots.len();
-        for from in 0..n {
-            for to in 0..n {
-                if from != to && fault.severs(self.robots[from].name.as_str(), self.robots[to].name.as_str()) {
-                    self.network.block(from, to, blocked);
-                }
-            }
-        }
-        self.update_hearing(now);
-    }
-
-    /// Notices who can hear whom, and plans to tell those for whom it changed.
-    fn update_hearing(&mut self, now: Instant) {
-        let options = self.network.options().clone();
-        let alive: Vec<bool> = self.robots.iter().map(|r| r.core.is_some() && now >= r.paused_until).collect();
-        for observer in 0..alive.len() {
-            for (subject, &subject_alive) in alive.iter().enumerate() {
-                let running = self.robots[observer].core.is_some();
-                let so = running && subject_alive && self.network.is_open(subject, observer);
-                let hearing = &mut self.robots[observer].hears[subject];
-                if hearing.so == so {
-                    continue;
-                }
-                hearing.so = so;
-                hearing.version += 1;
-                let delay = millis(if so { options.discover_ms } else { options.lease_ms });
-                self.queue.push(now.after(delay), Event::Hear { observer, subject, version: hearing.version });
-            }
-        }
-    }
-
-    fn sample(&mut self, now: Instant) {
-        let robots = self.robot_samples(now);
-        self.pin_frames(&robots);
-        let done = self.healed && all_done(&robots);
-        self.done_samples = if done { self.done_samples + 1 } else { 0 };
-        let phase = if self.healed { Phase::Calm } else { Phase::Storm };
-        let sample = Sample { phase, robots, truth: &self.truth, expect: &self.scenario.expect };
-        let (checks, stopwatch) = (&mut self.checks, &mut self.stopwatch);
-        if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {
-            self.violation.get_or_insert(violation);
-        }
-        // A snapshot costs more the more robots there are, and there are as many of them.
-        let pause = (0.2 * self.robots.len() as f64).max(1.0);
-        self.queue.push(now.after(millis(1e3 * pause)), Event::Sample);
-    }
-
-    fn robot_samples(&mut self, now: Instant) -> Vec<RobotSample> {
-        let stopwatch = &mut self.stopwatch;
-        let mut sample = |robot: &Robot<C>| {
-            let local = robot.local(now);
-            let core = robot.core.as_ref()?;
-            Some(RobotSample {
-                name: robot.name.to_string(),
-                digest: core.digest(),
-                snapshot: stopwatch.time("snapshot", || core.snapshot(local)),
-            })
-        };
-        self.robots.iter().filter_map(&mut sample).collect()
-    }
-
-    /// A frame truly lies where the first keyframe of its first submap does: every estimate starts there. Until a robot
-    /// has one, its first keyframe stands in; they differ if a crash swallowed what came between.
-    fn pin_frames(&mut self, samples: &[RobotSample]) {
-        for snapshot in samples.iter().filter_map(|sample| sample.snapshot.as_ref()) {
-            let first = |s: &&SubmapView| s.index == 0 && s.robot == snapshot.status.robot;
-            for submap in snapshot.map.submaps.iter().filter(first) {
-                let Some(robot) = self.find(&submap.robot) else { continue };
-                let slam = &self.robots[robot].slam;
-                let nanos = slam.drive_nanos(submap.stamps_secs[0]);
-                if let Some(step) = self.stage.steps(robot).iter().min_by_key(|step| step.nanos.abs_diff(nanos)) {
-                    self.truth.insert(submap.frame.clone(), step.t_world_body * slam.t_frame_body(step).inverse());
-                }
-            }
-        }
-    }
-
-    fn see(&mut self, robot: usize, seen: &Seen<'_>) {
-        let (checks, now) = (&mut self.checks, self.queue.now());
-        if let Some(violation) = self.stopwatch.time("check", || checks.see(now, robot, seen)) {
-            self.violation.get_or_insert(violation);
-        }
-    }
-
     fn find(&self, name: &str) -> Option<usize> {
         self.robots.iter().position(|robot| robot.name.as_str() == name)
-    }
-
-    fn with(&mut self, name: &str, act: impl FnOnce(&mut Self, usize)) {
-        if let Some(robot) = self.find(name) {
-            act(self, robot);
-        }
     }
 }
 
@@ -480,20 +310,28 @@ impl Event {
         match *self {
             Self::Keyframe { robot, .. }
             | Self::DriveEnds { robot }
-            | Self::Durable { robot, .. }
-            | Self::DiskRefuses { robot, .. }
+            | Self::Commit { robot, .. }
             | Self::JobDone { robot, .. }
             | Self::Wake { robot, .. } => Some(robot),
             Self::Broadcast { to, .. } | Self::Ask { to, .. } | Self::Answer { to, .. } => Some(to),
             Self::Hear { observer, .. } => Some(observer),
-            Self::Boot { .. } | Self::FaultBegins(_) | Self::FaultEnds(_) | Self::Heal | Self::Sample => None,
+            Self::Boot { .. }
+            | Self::CutNow { .. }
+            | Self::FaultBegins(_)
+            | Self::FaultEnds(_)
+            | Self::Flood(_)
+            | Self::Heal
+            | Self::Sample => None,
         }
     }
 }
 
+fn all_agree(robots: &[RobotSample]) -> bool {
+    robots.windows(2).all(|pair| pair[0].digest == pair[1].digest)
+}
+
 fn all_done(robots: &[RobotSample]) -> bool {
-    let same = robots.windows(2).all(|pair| pair[0].digest == pair[1].digest);
-    same && robots.iter().all(|robot| robot.snapshot.as_ref().is_none_or(|s| s.status.idle))
+    all_agree(robots) && robots.iter().all(|robot| robot.snapshot.as_ref().is_none_or(|s| s.status.idle))
 }
 
 fn secs(secs: f64) -> Instant {

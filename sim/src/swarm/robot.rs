@@ -11,6 +11,8 @@ use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovarian
 use merganser_protocol::ids::{Name, NameError, RobotId};
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::{Instant, Stamp};
+use merganser_store::Owner;
+use merganser_store::simulated::Picture;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,6 +20,9 @@ use std::collections::{BTreeMap, BTreeSet};
 const FIRST_SIGMA: f64 = 1e-6;
 /// The stamp that a clock without offset shows when the run begins, ns.
 const FIRST_STAMP_NS: i64 = 1_700_000_000_000_000_000;
+
+/// 2020-01-01 in seconds since 1970: epochs count from there.
+const EPOCH_ORIGIN_SECS: i64 = 1_577_836_800;
 
 /// One robot.
 pub(super) struct Robot<C> {
@@ -34,12 +39,20 @@ pub(super) struct Robot<C> {
     pub paused_until: Instant,
     pub gone: bool,
     pub store: Store,
-    pub disk_full: bool,
+    /// The disk as it was at some time.
+    pub image: Option<Picture>,
+    /// The fault that makes this robot another's twin.
+    pub twin: Option<usize>,
+    /// Tells two stories.
+    pub equivocates: bool,
+    /// Speaks another version.
+    pub other_version: bool,
     pub slam: Slam,
     pub questions: BTreeSet<QueryId>,
     pub asked: BTreeMap<u64, Asked>,
     pub tokens: u64,
     pub workers: Vec<Instant>,
+    /// One for each robot of the run.
     pub hears: Vec<Hearing>,
     pub usage: BTreeMap<&'static str, Usage>,
     pub keyframes: u64,
@@ -75,6 +88,7 @@ pub struct Usage {
 
 impl<C> Robot<C> {
     pub fn new(identity: Identity, id: RobotId, slam: Slam, scenario: &Scenario) -> Self {
+        let owner = Owner { swarm: identity.swarm.clone(), robot: identity.name.clone(), id };
         Self {
             name: identity.name.clone(),
             id,
@@ -85,17 +99,25 @@ impl<C> Robot<C> {
             wake: None,
             paused_until: Instant::ZERO,
             gone: false,
-            store: Store::default(),
-            disk_full: false,
+            store: Store::new(owner),
+            image: None,
+            twin: None,
+            equivocates: false,
+            other_version: false,
             slam,
             questions: BTreeSet::new(),
             asked: BTreeMap::new(),
             tokens: 0,
             workers: vec![Instant::ZERO; scenario.machine.workers],
-            hears: vec![Hearing::default(); scenario.robots],
+            hears: Vec::new(),
             usage: BTreeMap::new(),
             keyframes: 0,
         }
+    }
+
+    /// Its name, for people.
+    pub fn label(&self) -> String {
+        if self.twin.is_some() { format!("{}'s twin", self.name) } else { self.name.to_string() }
     }
 
     /// The process's own clock, which begins when it does.
@@ -145,8 +167,11 @@ impl<C> Robot<C> {
 
 /// The robot's SLAM, between the drive and the agent: it goes on when the agent's process does not, and can restart in
 /// a new local frame.
+#[derive(Clone)]
 pub(super) struct Slam {
     stamp_offset: i64,
+    /// Time since the drive began, ns, by stamp: clocks jump.
+    stamps: BTreeMap<i64, u64>,
     /// When each frame that a restart began, began, ns, and where in the drive.
     frames: Vec<(u64, Se3)>,
     restart: bool,
@@ -157,12 +182,26 @@ pub(super) struct Slam {
 impl Slam {
     pub fn new(offset_secs: f64) -> Self {
         let stamp_offset = FIRST_STAMP_NS + (offset_secs * 1e9) as i64;
-        Self { stamp_offset, frames: Vec::new(), restart: false, motion: None }
+        Self { stamp_offset, stamps: BTreeMap::new(), frames: Vec::new(), restart: false, motion: None }
     }
 
-    /// Time since the drive began of a stamp in seconds, ns: good to a microsecond.
+    /// Time since the drive began, ns, of the keyframe with the nearest stamp.
     pub fn drive_nanos(&self, stamp_secs: f64) -> u64 {
-        ((stamp_secs - self.stamp_offset as f64 * 1e-9).max(0.0) * 1e9) as u64
+        let stamp = (stamp_secs * 1e9) as i64;
+        let near = self.stamps.range(..=stamp).next_back().into_iter().chain(self.stamps.range(stamp..).next());
+        near.min_by_key(|(at, _)| at.abs_diff(stamp)).map_or(0, |(_, nanos)| *nanos)
+    }
+
+    /// The clock jumps; it shows 1970 at least.
+    pub fn jump(&mut self, secs: f64, now: Instant) {
+        let earliest = now.as_nanos().cast_signed().wrapping_neg();
+        self.stamp_offset = self.stamp_offset.saturating_add((secs * 1e9) as i64).max(earliest);
+    }
+
+    /// Seconds since 2020 that the clock shows.
+    pub fn wall_epoch(&self, now: Instant) -> u32 {
+        let secs = self.stamp_offset.saturating_add_unsigned(now.as_nanos()).div_euclid(1_000_000_000);
+        u32::try_from(secs - EPOCH_ORIGIN_SECS).unwrap_or(0)
     }
 
     /// The next keyframe begins a new frame.
@@ -190,8 +229,10 @@ impl Slam {
             motion.covariance = Covariance::from_sigmas([FIRST_SIGMA; 6])?;
         }
         let pose = self.t_frame_body(step);
+        let stamp = self.stamp_offset.saturating_add_unsigned(step.nanos);
+        self.stamps.insert(stamp, step.nanos);
         Ok(Keyframe {
-            stamp: Stamp(self.stamp_offset.saturating_add_unsigned(step.nanos)),
+            stamp: Stamp(stamp),
             pose: PoseWithCovariance { pose, covariance: motion.covariance },
             covariance_of: CovarianceOf::Motion,
             points,

@@ -64,6 +64,7 @@ robot = \"gamma\"
 [[faults]]
 kind = \"disk_full\"
 at = 12
+lasts = 4
 robot = \"delta\"
 ";
 

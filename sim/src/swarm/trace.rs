@@ -101,9 +101,11 @@ fn records_digest(records: &[Record]) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
     for record in records {
         let (kind, bytes) = match record {
-            Record::Entry { id, bytes } => (format!("entry {id}"), bytes),
-            Record::Blob { hash, bytes } => (format!("blob {hash}"), bytes),
-            Record::Private { submap, bytes } => (format!("private {submap}"), bytes),
+            Record::Entry { id, bytes } => (format!("entry {id}"), &bytes[..]),
+            Record::Blob { hash, bytes } => (format!("blob {hash}"), &bytes[..]),
+            Record::Private { submap, bytes } => (format!("private {submap}"), &bytes[..]),
+            Record::Fork { frame, proof } => (format!("fork {frame}"), &proof[1][..]),
+            Record::EpochClosed { epoch } => (format!("closed {epoch}"), &[][..]),
         };
         for part in [kind.as_bytes(), bytes] {
             hasher.update(&(part.len() as u64).to_le_bytes());

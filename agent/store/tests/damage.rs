@@ -1,0 +1,150 @@
+//! Bits that flip at rest: what is returned is what was stored, what is missing is counted, a log that may have lost an
+//! entry is closed for good, and the store works on.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "a test fails by panicking")]
+
+mod common;
+
+use common::{ROBOT, entry, on, owner, sorted};
+use merganser_protocol::agent::io::Record;
+use merganser_protocol::ids::{FrameId, Hash, SubmapId};
+use merganser_store::simulated::Disk;
+use merganser_store::{FileMedium, Medium, Store, StoreError, inspect};
+use std::collections::BTreeSet;
+
+const FLIPS: u64 = 1500;
+
+fn records() -> Vec<Record> {
+    let blob = |k: u8| vec![k; 900];
+    let submap = |index| SubmapId { frame: FrameId { robot: ROBOT, epoch: 9 }, index };
+    let entries = (0..60).map(|k| entry(k, &[k as u8; 300]));
+    let blobs = (0..6).map(|k| Record::Blob { hash: Hash::of(&blob(k)), bytes: blob(k) });
+    let private = (0..6).map(|k| Record::Private { submap: submap(k), bytes: vec![k as u8; 5000] });
+    entries.chain(blobs).chain(private).collect()
+}
+
+fn filled() -> Disk {
+    let disk = Disk::default();
+    let mut store = on(&disk).store;
+    for batch in records().chunks(5) {
+        store.commit(batch.iter()).unwrap();
+    }
+    disk
+}
+
+fn is_entry(text: &str) -> bool {
+    text.starts_with("Entry")
+}
+
+#[test]
+fn a_flipped_bit_is_found_and_costs_no_more_than_what_it_hit() {
+    let disk = filled();
+    let image = disk.picture();
+    let all: BTreeSet<String> = sorted(records()).into_iter().collect();
+    let (mut harmless, mut refused, mut lost_some, mut closed_logs) = (0, 0, 0, 0);
+    for seed in 0..FLIPS {
+        disk.restore(&image);
+        assert!(disk.flip(seed));
+        let opened = match Store::open(disk.clone(), owner(), 1) {
+            Ok(opened) => opened,
+            Err(StoreError::NotAStore { .. }) => {
+                refused += 1;
+                continue;
+            }
+            Err(other) => panic!("seed {seed}: {other}"),
+        };
+        let (closed, held): (Vec<_>, Vec<_>) =
+            sorted(opened.restored.records).into_iter().partition(|text| text.starts_with("EpochClosed"));
+        let held: BTreeSet<String> = held.into_iter().collect();
+        assert!(held.is_subset(&all), "seed {seed}: something that was never stored");
+        let missing: Vec<&String> = all.difference(&held).collect();
+        assert!(missing.is_empty() || opened.report.damaged_count > 0, "seed {seed}: {missing:?} is not told");
+        if missing.iter().any(|text| is_entry(text)) {
+            // Of a log that is lost as a whole, not even the epoch is known; what others know of it tells.
+            let wanted = if held.iter().any(|text| is_entry(text)) { 9 } else { 1 };
+            assert_eq!(
+                closed,
+                [format!("EpochClosed {{ epoch: {wanted} }}")],
+                "seed {seed}: a log with a hole goes on"
+            );
+        }
+        harmless += u64::from(opened.report.damaged_count == 0);
+        lost_some += u64::from(!missing.is_empty());
+        closed_logs += u64::from(!closed.is_empty());
+        assert_eq!(opened.report.unmended, None);
+
+        // What comes back from peers is taken, and the next start finds nothing wrong, but remembers.
+        let mut store = opened.store;
+        store.commit(records().iter()).unwrap();
+        drop(store);
+        let again = on(&disk);
+        assert_eq!(again.report.damaged_count, 0, "seed {seed}: {:?}", again.report);
+        let (still_closed, held): (Vec<_>, Vec<_>) =
+            sorted(again.restored.records).into_iter().partition(|text| text.starts_with("EpochClosed"));
+        assert_eq!((held.into_iter().collect::<BTreeSet<_>>(), still_closed), (all.clone(), closed), "seed {seed}");
+    }
+    println!(
+        "{FLIPS} flips: {harmless} hit nothing, {lost_some} cost records, {closed_logs} closed the log, {refused} refused"
+    );
+    assert!(lost_some > 100 && harmless > 100 && refused < FLIPS / 50);
+}
+
+#[test]
+fn looking_at_a_damaged_store_mends_nothing() {
+    let disk = filled();
+    let image = disk.picture();
+    let seed = (0..).find(|seed| {
+        disk.restore(&image);
+        disk.flip(*seed) && inspect(&disk).is_ok_and(|seen| seen.damaged.iter().any(|d| d.table == "entries"))
+    });
+    disk.restore(&image);
+    disk.flip(seed.unwrap());
+    let first = inspect(&disk).unwrap();
+    let second = inspect(&disk).unwrap();
+    assert_eq!((first.damaged, first.damaged_count), (second.damaged, second.damaged_count));
+    assert!(first.entries_lost && first.records.len() < records().len());
+}
+
+#[test]
+fn without_room_to_mend_the_sound_part_is_used_as_it_is() {
+    let disk = filled();
+    let image = disk.picture();
+    let mut unmended = 0;
+    for seed in 0..200 {
+        disk.restore(&image);
+        disk.flip(seed);
+        disk.with_faults(|faults| faults.full = true);
+        let opened = Store::open(disk.clone(), owner(), 1);
+        disk.with_faults(|faults| faults.full = false);
+        let Ok(opened) = opened else { continue };
+        unmended += usize::from(opened.report.unmended.is_some());
+        let found = opened.report.damaged_count;
+        let mut store = opened.store;
+        // The disk has room again: what was refetched replaces what was damaged, if the database can be written at all.
+        let first = store.commit(records().iter());
+        let done = first.is_ok() || store.commit(records().iter()).is_ok();
+        assert!(done, "seed {seed}: {found} damaged, {first:?}");
+    }
+    assert!(unmended > 20, "{unmended}");
+}
+
+#[test]
+fn the_damaged_file_is_kept_for_whoever_wants_to_look_at_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("s.redb");
+    let medium = FileMedium::new(&path);
+    let mut store = Store::open(medium.clone(), owner(), 1).unwrap().store;
+    store.commit(records().iter()).unwrap();
+    drop(store);
+    let mut bytes = std::fs::read(&path).unwrap();
+    let at = bytes.windows(300).position(|window| window == [33; 300]).unwrap();
+    bytes[at + 100] ^= 1;
+    std::fs::write(&path, &bytes).unwrap();
+    let opened = Store::open(medium.clone(), owner(), 1).unwrap();
+    assert!(opened.report.damaged.iter().any(|damage| damage.what.ends_with(":33")), "{:?}", opened.report);
+    assert_eq!(opened.restored.records.len(), records().len()); // one less, and the closing
+    drop(opened);
+    let kept = inspect(&FileMedium::new(dir.path().join("s.redb.damaged"))).unwrap();
+    assert!(kept.entries_lost);
+    assert!(!medium.path().with_extension("redb.new").exists());
+    assert_eq!(Store::open(medium, owner(), 1).unwrap().report.damaged_count, 0);
+}

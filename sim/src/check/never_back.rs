@@ -1,0 +1,195 @@
+//! What a robot holds never shrinks (DESIGN §8.3, §8.4, and no acknowledged fact is lost): a log that was durable on a
+//! robot's disk up to some place is so at every later moment and after every restart, a log in quarantine stays there,
+//! and the robot's own epoch does not fall. A disk that was wiped, or that lost what it had confirmed, is excused.
+
+use super::{Check, RobotSample, Sample, Seen};
+use merganser_protocol::agent::io::{Output, Record};
+use merganser_protocol::ids::{EntryId, FrameId};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// See the module.
+#[derive(Debug, Default)]
+pub struct NeverBack {
+    robots: BTreeMap<usize, Held>,
+}
+
+#[derive(Debug, Default)]
+struct Held {
+    logs: BTreeMap<FrameId, Log>,
+    epoch: u32,
+    /// Entries handed to the disk, by batch.
+    waiting: Vec<(u64, EntryId)>,
+    /// Proofs of forks, likewise.
+    proofs: Vec<(u64, FrameId)>,
+}
+
+#[derive(Debug, Default)]
+struct Log {
+    /// Its quarantine is on disk, and seen.
+    forked: bool,
+    /// Entries `0..len` were durable.
+    len: u32,
+    /// Durable ones beyond a hole.
+    beyond: BTreeSet<u32>,
+}
+
+impl Log {
+    fn add(&mut self, seq: u32) {
+        self.beyond.insert(seq);
+        while self.beyond.remove(&self.len) {
+            self.len += 1;
+        }
+        self.beyond.retain(|seq| *seq > self.len);
+    }
+}
+
+impl Held {
+    fn forget(&mut self) {
+        self.logs.clear();
+        self.epoch = 0;
+    }
+
+    fn compare(&mut self, robot: &RobotSample) -> Result<(), String> {
+        let name = &robot.name;
+        for (frame, log) in &mut self.logs {
+            match robot.logs.get(frame) {
+                Some(None) => log.len = 0,
+                Some(Some(_)) | None if log.forked => {
+                    return Err(format!("{name}: the quarantine of log {frame} was lifted"));
+                }
+                Some(Some(len)) if *len >= log.len => log.len = *len,
+                _ if log.len == 0 => {}
+                now => {
+                    let now = now.copied().flatten().unwrap_or(0);
+                    return Err(format!("{name}: log {frame} had {} durable entries and has {now}", log.len));
+                }
+            }
+        }
+        for (frame, len) in &robot.logs {
+            let log = self.logs.entry(*frame).or_default();
+            log.len = len.unwrap_or(0);
+        }
+        let Some(snapshot) = &robot.snapshot else { return Ok(()) };
+        let epoch = snapshot.status.epoch;
+        if epoch < self.epoch {
+            return Err(format!("{name}: its epoch fell from {} to {epoch}", self.epoch));
+        }
+        self.epoch = epoch;
+        Ok(())
+    }
+}
+
+impl Check for NeverBack {
+    fn name(&self) -> &'static str {
+        "never back"
+    }
+
+    fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
+        let held = self.robots.entry(robot).or_default();
+        match seen {
+            Seen::Output(Output::Persist { batch, records }) => {
+                held.proofs.extend(records.iter().filter_map(|record| match record {
+                    Record::Fork { frame, .. } => Some((*batch, *frame)),
+                    _ => None,
+                }));
+                held.waiting.extend(records.iter().filter_map(|record| match record {
+                    Record::Entry { id, .. } => Some((*batch, *id)),
+                    _ => None,
+                }));
+            }
+            Seen::Durable(batch) => {
+                let (durable, later): (Vec<_>, Vec<_>) = held.waiting.iter().partition(|(number, _)| number <= batch);
+                held.waiting = later;
+                let (forked, later): (Vec<_>, Vec<_>) = held.proofs.iter().partition(|(number, _)| number <= batch);
+                held.proofs = later;
+                forked.into_iter().for_each(|(_, frame)| held.logs.entry(frame).or_default().forked = true);
+                durable.into_iter().for_each(|(_, id)| held.logs.entry(id.frame).or_default().add(id.seq));
+            }
+            // An epoch that was begun and had no entry yet may die with its process.
+            Seen::Died => (held.waiting, held.proofs, held.epoch) = (Vec::new(), Vec::new(), 0),
+            Seen::Wiped | Seen::Damaged => held.forget(),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn sample(&mut self, sample: &Sample<'_>) -> Result<(), String> {
+        sample.robots.iter().try_for_each(|robot| self.robots.entry(robot.index).or_default().compare(robot))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{robot, sample};
+    use super::*;
+    use crate::scenario::Expect;
+    use merganser_protocol::ids::RobotId;
+
+    const FRAME: FrameId = FrameId { robot: RobotId([1; 8]), epoch: 4 };
+
+    fn look(check: &mut NeverBack, len: Option<u32>) -> Result<(), String> {
+        let mut one = robot("alpha", 1, &[]);
+        one.logs.insert(FRAME, len);
+        check.sample(&sample(vec![one], &BTreeMap::new(), &Expect::default()))
+    }
+
+    fn store(check: &mut NeverBack, seqs: core::ops::Range<u32>) {
+        let record = |seq| Record::Entry { id: EntryId { frame: FRAME, seq }, bytes: vec![] };
+        let output = Output::Persist { batch: 1, records: seqs.map(record).collect() };
+        check.see(0, &Seen::Output(&output)).unwrap();
+        check.see(0, &Seen::Durable(1)).unwrap();
+    }
+
+    #[test]
+    fn it_bites_on_a_log_that_shrinks_even_across_a_restart() {
+        let mut check = NeverBack::default();
+        store(&mut check, 0..3);
+        assert!(look(&mut check, Some(3)).is_ok());
+        check.see(0, &Seen::Died).unwrap();
+        assert!(look(&mut check, Some(4)).is_ok());
+        assert!(look(&mut check, Some(3)).is_err());
+        let mut check = NeverBack::default();
+        store(&mut check, 0..3);
+        assert!(look(&mut check, Some(2)).is_err(), "what the disk confirmed counts, seen or not");
+    }
+
+    #[test]
+    fn it_bites_on_a_quarantine_that_is_lifted() {
+        let mut check = NeverBack::default();
+        assert!(look(&mut check, Some(3)).is_ok());
+        assert!(look(&mut check, None).is_ok());
+        assert!(look(&mut check, Some(3)).is_ok(), "the proof died before it was on disk");
+        let output =
+            Output::Persist { batch: 1, records: vec![Record::Fork { frame: FRAME, proof: [vec![], vec![]] }] };
+        check.see(0, &Seen::Output(&output)).unwrap();
+        check.see(0, &Seen::Durable(1)).unwrap();
+        check.see(0, &Seen::Died).unwrap();
+        assert!(look(&mut check, None).is_ok());
+        assert!(look(&mut check, Some(3)).is_err());
+    }
+
+    #[test]
+    fn it_bites_on_an_epoch_that_falls() {
+        let (truth, expect) = (BTreeMap::new(), Expect::default());
+        let mut check = NeverBack::default();
+        let mut at = |epoch| {
+            let mut one = robot("alpha", 1, &[]);
+            one.snapshot.as_mut().unwrap().status.epoch = epoch;
+            check.sample(&sample(vec![one], &truth, &expect))
+        };
+        assert!(at(5).is_ok() && at(6).is_ok() && at(5).is_err());
+    }
+
+    #[test]
+    fn a_lost_disk_is_excused_and_entries_beyond_a_hole_are_no_promise() {
+        for seen in [Seen::Wiped, Seen::Damaged] {
+            let mut check = NeverBack::default();
+            assert!(look(&mut check, Some(3)).is_ok());
+            check.see(0, &seen).unwrap();
+            assert!(look(&mut check, Some(1)).is_ok());
+        }
+        let mut check = NeverBack::default();
+        store(&mut check, 5..7);
+        assert!(look(&mut check, Some(0)).is_ok());
+    }
+}

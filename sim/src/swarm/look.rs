@@ -1,0 +1,90 @@
+//! Looking at the swarm: samples for the checks, and where frames truly lie.
+
+use super::robot::Robot;
+use super::{Event, Swarm, all_agree, all_done};
+use crate::check::{Phase, RobotSample, Sample, Seen};
+use crate::core::Core;
+use crate::network::millis;
+use merganser_protocol::snapshot::SubmapView;
+use merganser_protocol::time::Instant;
+
+impl<C: Core> Swarm<C> {
+    /// Notices who can hear whom, and plans to tell those for whom it changed.
+    pub(super) fn update_hearing(&mut self, now: Instant) {
+        let options = self.network.options().clone();
+        let alive: Vec<bool> = self.robots.iter().map(|r| r.core.is_some() && now >= r.paused_until).collect();
+        for observer in 0..alive.len() {
+            for (subject, &subject_alive) in alive.iter().enumerate() {
+                let running = self.robots[observer].core.is_some();
+                // Two robots under one name look like one: that a twin comes or goes, nobody sees.
+                let shows = self.robots[subject].twin.is_none() && self.robots[subject].id != self.robots[observer].id;
+                let so = running && subject_alive && shows && self.network.is_open(subject, observer);
+                let hearing = &mut self.robots[observer].hears[subject];
+                if hearing.so == so {
+                    continue;
+                }
+                hearing.so = so;
+                hearing.version += 1;
+                let delay = millis(if so { options.discover_ms } else { options.lease_ms });
+                self.queue.push(now.after(delay), Event::Hear { observer, subject, version: hearing.version });
+            }
+        }
+    }
+
+    pub(super) fn sample(&mut self, now: Instant) {
+        let robots = self.robot_samples(now);
+        self.pin_frames(&robots);
+        self.agreed_since = self.agreed_since.or(Some(now)).filter(|_| self.healed && all_agree(&robots));
+        let done = self.healed && all_done(&robots);
+        self.done_samples = if done { self.done_samples + 1 } else { 0 };
+        let phase = if self.healed { Phase::Calm } else { Phase::Storm };
+        let sample = Sample { phase, robots, truth: &self.truth, expect: &self.scenario.expect };
+        let (checks, stopwatch) = (&mut self.checks, &mut self.stopwatch);
+        if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {
+            self.violation.get_or_insert(violation);
+        }
+        // A snapshot costs more the more robots there are, and there are as many of them.
+        let pause = (0.2 * self.robots.len() as f64).max(1.0);
+        self.queue.push(now.after(millis(1e3 * pause)), Event::Sample);
+    }
+
+    pub(super) fn robot_samples(&mut self, now: Instant) -> Vec<RobotSample> {
+        let stopwatch = &mut self.stopwatch;
+        let mut sample = |(index, robot): (usize, &Robot<C>)| {
+            let local = robot.local(now);
+            let core = robot.core.as_ref()?;
+            Some(RobotSample {
+                index,
+                name: robot.label(),
+                digest: core.digest(),
+                logs: core.logs(),
+                disk_bytes: robot.store.disk().len(),
+                snapshot: stopwatch.time("snapshot", || core.snapshot(local)),
+            })
+        };
+        self.robots.iter().enumerate().filter_map(&mut sample).collect()
+    }
+
+    /// A frame truly lies where the first keyframe of its first submap does: every estimate starts there. Until a robot
+    /// has one, its first keyframe stands in; they differ if a crash swallowed what came between.
+    pub(super) fn pin_frames(&mut self, samples: &[RobotSample]) {
+        for snapshot in samples.iter().filter_map(|sample| sample.snapshot.as_ref()) {
+            let first = |s: &&SubmapView| s.index == 0 && s.robot == snapshot.status.robot;
+            for submap in snapshot.map.submaps.iter().filter(first) {
+                let Some(robot) = self.find(&submap.robot) else { continue };
+                let slam = &self.robots[robot].slam;
+                let nanos = slam.drive_nanos(submap.stamps_secs[0]);
+                if let Some(step) = self.stage.steps(robot).iter().min_by_key(|step| step.nanos.abs_diff(nanos)) {
+                    self.truth.insert(submap.frame.clone(), step.t_world_body * slam.t_frame_body(step).inverse());
+                }
+            }
+        }
+    }
+
+    pub(super) fn see(&mut self, robot: usize, seen: &Seen<'_>) {
+        let (checks, now) = (&mut self.checks, self.queue.now());
+        if let Some(violation) = self.stopwatch.time("check", || checks.see(now, robot, seen)) {
+            self.violation.get_or_insert(violation);
+        }
+    }
+}
