@@ -130,6 +130,8 @@ pub struct GossipConfig {
     pub pose_secs: f64,
     /// Bytes of entries in one sync answer at most.
     pub delta_bytes_max: usize,
+    /// Bytes of keypoint blobs asked for per second at most: leave room for poses and facts on the slowest link.
+    pub blob_bytes_per_sec: f64,
     /// How long an unanswered question is waited for.
     pub answer_secs: f64,
     /// Entries held per robot and epoch at most.
@@ -144,6 +146,7 @@ impl Default for GossipConfig {
             have_secs: 16.0,
             pose_secs: 0.5,
             delta_bytes_max: 64 * 1024,
+            blob_bytes_per_sec: 250_000.0,
             answer_secs: 2.0,
             entries_per_frame_max: 100_000,
             epochs_per_robot_max: 64,
@@ -199,6 +202,7 @@ impl Config {
         range("gossip.have_secs", g.have_secs, 0.01, 3600.0, "use 0.01 to 3600 s")?;
         range("gossip.pose_secs", g.pose_secs, 0.01, 3600.0, "use 0.01 to 3600 s")?;
         range("gossip.delta_bytes_max", g.delta_bytes_max as f64, 4096.0, 65536.0, "use 4096 to 65536 bytes")?;
+        range("gossip.blob_bytes_per_sec", g.blob_bytes_per_sec, 1e3, 1e9, "use 1000 to 1e9 bytes per second")?;
         range("gossip.answer_secs", g.answer_secs, 0.01, 600.0, "use 0.01 to 600 s")?;
         range("gossip.entries_per_frame_max", f64::from(g.entries_per_frame_max), 1.0, 1e7, "use 1 to 10000000")?;
         range("gossip.epochs_per_robot_max", g.epochs_per_robot_max as f64, 1.0, 1e4, "use 1 to 10000")

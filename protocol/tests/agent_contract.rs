@@ -4,13 +4,14 @@
 mod common;
 
 use common::{Wires, World, agent, drive, name, robot};
-use merganser_protocol::agent::Restored;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Output, QueryKind, Record};
+use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::ids::{FrameId, Name, RobotId};
 use merganser_protocol::replica::Replica;
 use merganser_protocol::time::Instant;
 use merganser_protocol::wire::EntryBytes;
 use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
+use merganser_protocol::wire::limits::BLOB_PIECE_LEN;
 use merganser_protocol::wire::messages::Message;
 use std::time::Duration;
 
@@ -22,14 +23,16 @@ fn drain(agent: &mut merganser_protocol::agent::Agent) -> Vec<Output> {
 fn only_handle_makes_outputs_and_changes_the_timeout() {
     let mut agent = agent(0, Restored::default());
     agent.handle(Instant::ZERO, Input::Neighbour { robot: robot(1), up: true });
-    let first = drain(&mut agent);
-    assert!(!first.is_empty(), "contact is answered with an announcement");
+    let _ = drain(&mut agent);
     let timeout = agent.poll_timeout();
-    assert!(timeout.is_some_and(|t| t > Instant::ZERO));
+    assert!(timeout.is_some_and(|t| t > Instant::ZERO && t < Instant::ZERO.after(Duration::from_millis(101))));
     assert!(agent.poll_output().is_none());
     assert_eq!(agent.poll_timeout(), timeout);
     agent.handle(timeout.unwrap(), Input::Timeout);
     assert!(agent.poll_timeout() > timeout, "a timeout that was served moves on");
+    let said = drain(&mut agent);
+    let announced = |output: &Output| matches!(output, Output::Publish { channel: Channel::Have, .. });
+    assert!(said.iter().any(announced), "contact is answered with an announcement");
 }
 
 #[test]
@@ -92,6 +95,36 @@ fn three_robots_merge_and_hold_the_same_map() {
         let error = nalgebra::Vector3::from(found.pose.translation) - t_own_frame.translation;
         assert!(error.norm() < 0.15, "frame of robot {k} is off by {:.3} m", error.norm());
     }
+}
+
+#[test]
+fn blobs_come_in_paced_pieces_and_whole() {
+    let world = World::new(1);
+    let mut config = common::config();
+    config.submap.keypoints = 1024;
+    config.gossip.blob_bytes_per_sec = 50_000.0;
+    let pause = Duration::from_secs_f64(BLOB_PIECE_LEN as f64 / config.gossip.blob_bytes_per_sec);
+    let agent = |k| Agent::new(config.clone(), common::identity(k), 42, Restored::default(), Instant::ZERO).unwrap();
+    let mut wires = Wires::new((0..2).map(agent).collect());
+    for k in 0..2 {
+        drive(&world, k, 12).0.into_iter().for_each(|keyframe| wires.input(k, Input::Keyframe(keyframe)));
+        wires.input(k, Input::Command(Command::Flush));
+    }
+    wires.run(Duration::from_secs(60));
+    assert!(wires.agents.iter().all(|agent| agent.status().idle), "no blob is missing");
+    let mut longest = 0;
+    for k in 0..2 {
+        let asked: Vec<_> = wires.pieces.iter().filter(|(asker, ..)| *asker == k).collect();
+        assert!(asked.windows(2).all(|two| two[1].1.since(two[0].1) >= pause), "too fast");
+        for (.., answer) in asked {
+            let Ok(Message::BlobReply { bytes, total, .. }) = Message::decode(answer.as_ref().unwrap()) else {
+                panic!()
+            };
+            assert!(bytes.len() <= BLOB_PIECE_LEN);
+            longest = longest.max(total as usize);
+        }
+    }
+    assert!(longest > BLOB_PIECE_LEN, "some blob needed two pieces: {longest} bytes");
 }
 
 #[test]

@@ -9,11 +9,15 @@ use super::negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, Candidate, FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work,
 };
 use crate::geometry::Relative;
-use crate::ids::{EntryId, FrameId, Hash, SubmapId};
+use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::Summary;
 use crate::time::Instant;
 use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, SubmapFact, VerdictFact, VerdictOutcome};
+use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
+
+/// When a fetch is looked at again that nobody can serve now.
+const FETCH_AGAIN: Duration = Duration::from_millis(500);
 
 /// Undisputed alignments stated so far, per pair of frames.
 type Stated = BTreeMap<(FrameId, FrameId), usize>;
@@ -218,8 +222,8 @@ impl Agent {
         let Some(fact) = self.knowledge.submap(theirs) else { return false };
         let (blob, scale) = (fact.blob, fact.scale);
         let Some(keypoints) = self.negotiation.keypoints(blob).cloned() else {
-            let fetch = Fetch { owner: theirs.frame.robot, query: None, failures: 0, not_before: self.now };
-            self.negotiation.fetches.entry(blob).or_insert(fetch);
+            let fetch = || Fetch::new(theirs.frame.robot, self.now);
+            self.negotiation.fetches.entry(blob).or_insert_with(fetch);
             return false;
         };
         let Some(features) = self.negotiation.features(mine).cloned() else { return false };
@@ -263,33 +267,34 @@ impl Agent {
     }
 
     fn start_fetching(&mut self) {
-        let due: Vec<(Hash, Fetch)> = self
+        let idle = |fetch: &Fetch| fetch.query.is_none() && fetch.not_before <= self.now;
+        let due: Vec<(Hash, Option<RobotId>, usize)> = self
             .negotiation
             .fetches
             .iter()
-            .filter(|(_, fetch)| fetch.query.is_none() && fetch.not_before <= self.now)
-            .map(|(hash, fetch)| (*hash, *fetch))
+            .filter(|(_, fetch)| idle(fetch))
+            .map(|(hash, fetch)| (*hash, self.holder(fetch), fetch.got.len()))
             .collect();
         let mut free =
             FETCHES_MAX.saturating_sub(self.negotiation.fetches.values().filter(|f| f.query.is_some()).count());
-        for (hash, fetch) in due {
-            let peer = self.holder(&fetch);
-            if free == 0 || peer.is_none() {
-                // Nobody to ask, or enough under way: look again a little later, not at once.
-                let later = self.now.after(core::time::Duration::from_millis(500));
-                self.negotiation.fetches.entry(hash).and_modify(|fetch| fetch.not_before = later);
-                continue;
-            }
-            if let Some(peer) = peer {
-                free -= 1;
-                let query = self.fetch_blob(hash, peer);
-                self.negotiation.fetches.entry(hash).and_modify(|fetch| fetch.query = Some(query));
-            }
+        for (hash, peer, offset) in due {
+            let query = match peer {
+                Some(peer) if free > 0 && self.gossip.may_fetch(self.now) => self.fetch_blob(hash, offset, peer),
+                // Nobody to ask, enough under way, or too soon: look again later.
+                _ => {
+                    let idle = peer.is_none() || free == 0;
+                    let later = if idle { self.now.after(FETCH_AGAIN) } else { self.gossip.next_piece() };
+                    self.negotiation.fetches.entry(hash).and_modify(|fetch| fetch.not_before = later);
+                    continue;
+                }
+            };
+            free -= 1;
+            self.negotiation.fetches.entry(hash).and_modify(|fetch| fetch.query = Some(query));
         }
     }
 
     /// Whom to ask for a blob: its owner, or after failures any neighbour in turn (whoever fetched it has it).
-    fn holder(&self, fetch: &Fetch) -> Option<crate::ids::RobotId> {
+    fn holder(&self, fetch: &Fetch) -> Option<RobotId> {
         let spread = &self.gossip.spread;
         let turn = fetch.failures as usize;
         if turn.is_multiple_of(2) && spread.is_neighbour(fetch.owner) {

@@ -9,7 +9,7 @@ use crate::config::GossipConfig;
 use crate::gossip::{Answer, Spread, Step};
 use crate::ids::{EntryId, Hash, RobotId, SubmapId};
 use crate::time::Instant;
-use crate::wire::limits::BLOB_LEN_MAX;
+use crate::wire::limits::BLOB_PIECE_LEN;
 use crate::wire::messages::{AlignStatus, Message};
 use crate::wire::{Beacon, BeaconContent};
 use core::time::Duration;
@@ -29,6 +29,7 @@ pub(super) struct Gossip {
     blobs: BTreeMap<Hash, Vec<u8>>,
     questions: BTreeMap<QueryId, Question>,
     next_pose: Instant,
+    next_piece: Instant,
     next_wish: Instant,
     beacon_counter: u64,
 }
@@ -63,6 +64,7 @@ impl Gossip {
             blobs: BTreeMap::new(),
             questions: BTreeMap::new(),
             next_pose: now,
+            next_piece: now,
             next_wish: now,
             beacon_counter: 0,
         }
@@ -74,6 +76,16 @@ impl Gossip {
 
     pub(super) fn beacons(&self) -> impl Iterator<Item = (RobotId, &SeenBeacon)> {
         self.beacons.iter().map(|(robot, seen)| (*robot, seen))
+    }
+
+    /// Whether the next piece of a blob may be asked for.
+    pub(super) fn may_fetch(&self, now: Instant) -> bool {
+        now >= self.next_piece
+    }
+
+    /// When the next piece of a blob may be asked for.
+    pub(super) fn next_piece(&self) -> Instant {
+        self.next_piece
     }
 
     pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>) {
@@ -216,8 +228,12 @@ impl Agent {
         }
     }
 
-    pub(super) fn fetch_blob(&mut self, hash: Hash, peer: RobotId) -> QueryId {
-        let request = Message::BlobRequest { hash, offset: 0, len: BLOB_LEN_MAX as u32 };
+    /// Asks for the next piece of a blob. Pieces are paced: on a slow link a whole blob would delay poses by half a
+    /// second, whatever their priority, because the queue is the kernel's.
+    pub(super) fn fetch_blob(&mut self, hash: Hash, offset: usize, peer: RobotId) -> QueryId {
+        let pause = BLOB_PIECE_LEN as f64 / self.config.gossip.blob_bytes_per_sec;
+        self.gossip.next_piece = self.now.after(Duration::from_secs_f64(pause));
+        let request = Message::BlobRequest { hash, offset: offset as u32, len: BLOB_PIECE_LEN as u32 };
         self.ask(peer, QueryKind::Blob, &request, About::Blob(hash))
     }
 
@@ -254,8 +270,8 @@ impl Agent {
                 self.synced(question.peer, Answer::Got { new, more: delta.more });
             }
             (About::Sync, _) => self.synced(question.peer, if refused { Answer::Refused } else { Answer::Failed }),
-            (About::Blob(hash), Some(Message::BlobReply { hash: got, bytes, .. })) if got == hash => {
-                self.on_blob(query, question.peer, hash, bytes);
+            (About::Blob(hash), Some(Message::BlobReply { hash: named, offset, total, bytes })) if named == hash => {
+                self.on_piece(query, question.peer, hash, (offset, total), &bytes);
             }
             (About::Blob(_), _) => self.negotiation.fetch_failed(query, self.now),
             (About::Align, _) => {}
@@ -266,7 +282,20 @@ impl Agent {
         self.gossip.spread.on_answer(self.now, &self.replica, peer, answer);
     }
 
-    fn on_blob(&mut self, query: QueryId, peer: RobotId, hash: Hash, bytes: Vec<u8>) {
+    /// A piece of a blob came. Pieces may come from different robots; the hash of the whole decides.
+    fn on_piece(&mut self, query: QueryId, peer: RobotId, hash: Hash, (offset, total): (u32, u32), piece: &[u8]) {
+        let Some(fetch) = self.negotiation.fetches.get_mut(&hash) else { return };
+        let left = (total as usize).saturating_sub(fetch.got.len());
+        if offset as usize != fetch.got.len() || piece.is_empty() || piece.len() != left.min(BLOB_PIECE_LEN) {
+            return self.negotiation.fetch_failed(query, self.now);
+        }
+        fetch.got.extend_from_slice(piece);
+        if fetch.got.len() < total as usize {
+            fetch.query = None;
+            fetch.not_before = self.gossip.next_piece;
+            return;
+        }
+        let bytes = core::mem::take(&mut fetch.got);
         if Hash::of(&bytes) == hash {
             self.keep_blob(bytes);
         } else {

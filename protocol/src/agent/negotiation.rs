@@ -68,9 +68,11 @@ pub struct Work {
     pub purpose: Purpose,
 }
 
-/// A blob on its way.
-#[derive(Clone, Copy, Debug)]
+/// A blob on its way, piece by piece.
+#[derive(Clone, Debug)]
 pub struct Fetch {
+    /// The pieces that came, in order.
+    pub got: Vec<u8>,
     /// The robot that made it.
     pub owner: RobotId,
     /// The question under way, if any.
@@ -79,6 +81,13 @@ pub struct Fetch {
     pub failures: u32,
     /// Not asked again before.
     pub not_before: Instant,
+}
+
+impl Fetch {
+    /// Nothing came yet, nobody is asked.
+    pub fn new(owner: RobotId, now: Instant) -> Self {
+        Self { got: Vec::new(), owner, query: None, failures: 0, not_before: now }
+    }
 }
 
 /// Everything the negotiation remembers.
@@ -293,8 +302,7 @@ mod tests {
     fn a_failing_fetch_backs_off_and_is_given_up_at_the_bound() {
         let mut n = Negotiation::default();
         let (hash, query) = (Hash::of(b"x"), QueryId(7));
-        n.fetches
-            .insert(hash, Fetch { owner: RobotId([2; 8]), query: Some(query), failures: 0, not_before: Instant::ZERO });
+        n.fetches.insert(hash, Fetch::new(RobotId([2; 8]), Instant::ZERO));
         let mut last = Duration::ZERO;
         for _ in 1..FETCH_ATTEMPTS_MAX {
             n.fetches.get_mut(&hash).unwrap().query = Some(query);

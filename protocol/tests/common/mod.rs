@@ -7,7 +7,7 @@
     reason = "a failed unwrap in a test is its report"
 )]
 
-use merganser_protocol::agent::io::{Channel, Event, Input, Output, Record};
+use merganser_protocol::agent::io::{Channel, Event, Input, Output, QueryKind, Record};
 use merganser_protocol::agent::{Agent, Identity, Restored};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
@@ -134,6 +134,8 @@ pub struct Wires {
     pub events: Vec<(usize, Event)>,
     pub disks: Vec<Vec<Record>>,
     pub published: Vec<(usize, Channel, Vec<u8>)>,
+    /// Who asked for a piece of a blob, when, and the answer.
+    pub pieces: Vec<(usize, Instant, Option<Vec<u8>>)>,
     inbox: VecDeque<(usize, Input)>,
 }
 
@@ -146,6 +148,7 @@ impl Wires {
             events: Vec::new(),
             disks,
             published: Vec::new(),
+            pieces: Vec::new(),
             inbox: VecDeque::new(),
         };
         for a in 0..wires.agents.len() {
@@ -217,6 +220,9 @@ impl Wires {
                     }
                     answer.expect("every question is answered at once")
                 });
+                if kind == QueryKind::Blob {
+                    self.pieces.push((k, self.now, answer.clone()));
+                }
                 self.inbox.push_back((k, Input::Answered { query, bytes: answer }));
             }
             Output::Answer { .. } => {}
