@@ -2,8 +2,8 @@
 //! similarity with a calibrated covariance, or to a refusal that says why.
 //!
 //! The noise scale σ is not told, only bounded by `sigma_max`; it is marginalised in each step (MATH §4):
-//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree (`graph`; for SIM(3) at one scale,
-//!    `scales`), ranked by how many further matches agree with them, on nested prefixes of the matches (best scores first)
+//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree (`graph`; for SIM(3) from matches that agree
+//!    about a pair, at one scale, `scales`, and on one turn, `turns`), ranked by how many further matches agree with them, on nested prefixes of the matches (best scores first)
 //!    and σ levels from tight to loose; `tally` prescores each by its own number of false alarms over all radii.
 //! 2. `evidence` starts the refinement at the σ of highest evidence, of a Gaussian-inlier, uniform-outlier mixture.
 //! 3. `refine` polishes by expectation-maximisation, then by the kernel density weights S(12)–S(30) of [`sigma`] where
@@ -31,6 +31,7 @@ mod solve;
 mod tally;
 #[cfg(test)]
 mod tests;
+mod turns;
 
 use crate::geometry::Relative;
 use crate::wire::fact::RefusalReason;

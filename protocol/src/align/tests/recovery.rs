@@ -60,6 +60,22 @@ fn similarities_are_found() {
 }
 
 #[test]
+fn ten_true_of_a_thousand_are_found_at_an_unknown_scale() {
+    let model = Model::Similarity { scale_min: 0.4, scale_max: 2.5 };
+    for times in [3.0, 10.0] {
+        let mut right = 0;
+        for seed in 0..20 {
+            let case = Case::uniform(700 + seed, 1000, 10, 0.8 + 0.06 * seed as f64);
+            if let Ok(found) = case.solve(&SolverConfig { model, ..config(times * SIGMA) }) {
+                assert!(case.recovered_by(&found), "seed {seed}: {found:?}");
+                right += 1;
+            }
+        }
+        assert!(right >= 19, "{right} of 20 at {times} σ");
+    }
+}
+
+#[test]
 fn shrinking_never_wins() {
     // A tight cluster of targets would fit any source shrunk onto it.
     let mut draw = Draw::new(9);
