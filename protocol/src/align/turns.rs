@@ -283,7 +283,8 @@ mod tests {
     /// Points, and their images turned by `angle` about the z-axis, at scale 2.
     fn turned(count: usize, angle: f32) -> Cloud {
         let (sine, cosine) = (libm::sinf(angle), libm::cosf(angle));
-        let mut cloud = Cloud { count, words: 1, ..Cloud::default() };
+        let mut cloud = Cloud::default();
+        cloud.count = count;
         for p in (0..count).map(scattered) {
             let q = [cosine * p[0] - sine * p[1], sine * p[0] + cosine * p[1], p[2]];
             for axis in 0..3 {
