@@ -232,7 +232,8 @@ fn good_scores_help_and_bad_scores_do_not_hurt() {
     let case = Case::uniform(4, 600, 20, 1.0);
     for sign in [1.0, -1.0] {
         let scores: Vec<f64> = (0..600).map(|i| if i < 20 { sign } else { 0.0 }).collect();
-        let problem = Problem { source: &case.source, target: &case.target, scores: Some(&scores) };
+        let problem =
+            Problem { source: &case.source, target: &case.target, scores: Some(&scores), ..Problem::default() };
         let found = align(&problem, &config(3.0 * SIGMA)).expect("well-formed").expect("20 inliers");
         assert!(case.recovered_by(&found));
     }
