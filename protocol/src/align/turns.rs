@@ -216,7 +216,8 @@ impl Turn {
         let at = if cosine >= 0.0 { sine / sum } else { 2.0 - sine / sum };
         let slope = (cosine * cosine + sine * sine) / (sum * sum);
         let half = QUARTER * slope * self.reach / (c * c + d * d).sqrt();
-        if !(half < 0.5 * (CELLS - 2) as f32) || !(sum > 0.0) {
+        let told = half < 0.5 * (CELLS - 2) as f32 && sum > 0.0;
+        if !told {
             return Arc { first: 0, extent: CELLS as u32 - 1 };
         }
         let middle = QUARTER * (at + 1.0) + CELLS as f32;
@@ -232,7 +233,7 @@ impl Frame {
         let origin = points.each_ref().map(|axis| axis[i]);
         let along = points.each_ref().map(|axis| axis[j] - axis[i]);
         let length = dot(&along, &along).sqrt();
-        if !(length > 0.0) {
+        if length <= 0.0 {
             return None;
         }
         let u = along.map(|a| a / length);
@@ -309,9 +310,9 @@ mod tests {
             let arcs: Vec<Arc> = (0..40).filter(|k| ![3, 17].contains(k)).map(|k| truth.of(&cloud, k)).collect();
             let agree = |arcs: &[Arc]| (0..CELLS).map(|c| arcs.iter().filter(|a| covers(a, c)).count()).max();
             assert_eq!(agree(&arcs), Some(38), "turn {step}");
-            for axis in 0..3 {
+            for (axis, shuffled) in cloud.target.iter_mut().zip(&shuffled) {
                 for k in (0..40).filter(|k| ![3, 17].contains(k)) {
-                    cloud.target[axis][k] = shuffled[axis][k];
+                    axis[k] = shuffled[k];
                 }
             }
             let arcs: Vec<Arc> = (0..40).filter(|k| ![3, 17].contains(k)).map(|k| truth.of(&cloud, k)).collect();
