@@ -38,7 +38,7 @@ fn alignments(c: &mut Criterion) {
             let (source, target) = matches(n, inliers);
             let config = SolverConfig { model, sigma_max: 3.0 * SIGMA, ..SolverConfig::default() };
             group.bench_function(BenchmarkId::new(name, format!("{inliers}_of_{n}")), |b| {
-                let problem = Problem { source: &source, target: &target, scores: None };
+                let problem = Problem { source: &source, target: &target, ..Problem::default() };
                 b.iter(|| black_box(align(&problem, &config).unwrap()));
             });
         }
@@ -54,7 +54,7 @@ fn generous_bound(c: &mut Criterion) {
         let (source, target) = matches(n, inliers);
         let config = SolverConfig { sigma_max: 10.0 * SIGMA, ..SolverConfig::default() };
         group.bench_function(BenchmarkId::new("se3", format!("{inliers}_of_{n}")), |b| {
-            let problem = Problem { source: &source, target: &target, scores: None };
+            let problem = Problem { source: &source, target: &target, ..Problem::default() };
             b.iter(|| black_box(align(&problem, &config).unwrap()));
         });
     }

@@ -103,7 +103,7 @@ fn cpu_seconds() -> f64 {
 }
 
 fn run(case: &Case, config: &SolverConfig, cell: &mut Cell) {
-    let problem = Problem { source: &case.source, target: &case.target, scores: None };
+    let problem = Problem { source: &case.source, target: &case.target, ..Problem::default() };
     let start = cpu_seconds();
     let result = align(&problem, config).unwrap();
     cell.millis.push((cpu_seconds() - start) * 1e3);

@@ -127,7 +127,12 @@ impl AlignJob {
     /// Matches, finds a consensus, checks the fit, refines (MATH §4; PERCEPTION).
     fn run(&self) -> Result<Measured, RefusalReason> {
         let matches = submap::match_keypoints(&self.theirs, &self.mine);
-        let problem = Problem { source: &matches.source, target: &matches.target, scores: Some(&matches.scores) };
+        let problem = Problem {
+            source: &matches.source,
+            target: &matches.target,
+            scores: Some(&matches.scores),
+            ..Problem::default()
+        };
         let found = crate::align::align(&problem, &self.solver())
             .map_err(|_| RefusalReason::BadInput)?
             .map_err(RefusalReason::from)?;

@@ -3,7 +3,9 @@
 //!
 //! `NFA = (k − 3)(k − 2) C(n, k) π₃ α^(k − 3)`: α is the chance that a random target lies within the k-th smallest residual of
 //! a given place, and π₃ the chance that a random triangle is rigid to that accuracy at all; both are measured on the
-//! problem ([`super::chance`]). The first factors share the false alarms out among the k tried: Σ 1/((k − 3)(k − 2)) is 1 from
+//! problem ([`super::chance`]). With covariances a match's region is an ellipsoid; the mean volume of all matches' at the
+//! same Mahalanobis distance takes the sphere's place (of products over subsets the power of the mean is the upper bound).
+//! It counts as the sphere of that volume for α, and of the ellipsoids' largest axes for π₃. The first factors share the false alarms out among the k tried: Σ 1/((k − 3)(k − 2)) is 1 from
 //! k = 4 on, as is the sum of MATH's 1/(n − 3) over all k, but a small consensus is the one in doubt. MATH's C(k, 3) is absent: it counts each subset once for each of its triangles. Evidence is
 //! not used: on pure outliers it accepts 76–100 % (*measured*).
 
@@ -51,6 +53,8 @@ pub(super) fn significance(
     let floor = context.sigma_max / super::evidence::SIGMA_SPAN;
     let n_f = n as f64;
     let unit = fit.motion.residual_unit();
+    let sphere = libm::cbrt(fit.region());
+    let widest = matches.noise.as_ref().map_or(1.0, |noise| noise.widest(fit.motion.scale));
     let mut choose = log(n_f * (n_f - 1.0) * (n_f - 2.0) / 6.0);
     let mut best = Significance { log10_nfa: log10(n_f.max(1.0)), count: 0 };
     for (rank, &i) in scratch.order.iter().enumerate().skip(3) {
@@ -60,7 +64,7 @@ pub(super) fn significance(
             continue;
         }
         let r = fit.squared[i as usize].sqrt().max(floor) * unit;
-        let (rigid, alpha) = (matches.chance.rigid_triangle(2.0 * r), matches.chance.alpha(r));
+        let (rigid, alpha) = (matches.chance.rigid_triangle(2.0 * r * widest), matches.chance.alpha(r * sphere));
         let log10_nfa =
             (log(drawn * (drawn + 1.0)) + choose + log(rigid) + drawn * log(alpha)) * core::f64::consts::LOG10_E;
         if log10_nfa < best.log10_nfa {

@@ -8,17 +8,12 @@ use super::refine::{self, Context, Fit};
 use super::sample::{Candidate, Sampler, Step};
 use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig, Standing};
 
-/// Size of the first prefix of matches searched.
-const PREFIX_FIRST: usize = 128;
-/// Each next prefix is larger by this factor: rigid, with scale. The costlier the search, the finer the steps.
-const PREFIX_GROWTH: [usize; 2] = [4, 2];
-/// Largest prefix searched: rigid, with scale. Bounds time and memory, which grow with its square and worse.
-const PREFIX_LARGEST: [usize; 2] = [8192, 2048];
-/// σ levels: σ_max over 1, 2, 4, 8, 16.
-const LEVELS: u32 = 5;
-/// Relative cost of a level, or doubt that it is the right one: σ_max is commonly 3–10 × the truth, and the tighter
-/// graph is the cheaper.
-const LEVEL_COSTS: [usize; LEVELS as usize] = [16, 5, 4, 6, 10];
+/// Prefixes of the matches searched: rigid, with scale. The costlier the search, the finer the steps; the largest bounds
+/// time and memory, which grow with its square and worse.
+const PREFIXES: [&[usize]; 2] = [&[128, 512, 2048, 8192], &[128, 256, 1024, 2048]];
+/// σ levels, σ_max over 2^level, each with its relative cost, or doubt that it is the right one: σ_max is commonly 3–10 ×
+/// the truth, and the tighter graph is the cheaper. With scale one level serves for noise from a half to three times its own.
+const LEVELS: [&[(u32, usize)]; 2] = [&[(0, 16), (1, 5), (2, 4), (3, 6), (4, 10)], &[(1, 24), (2, 4), (4, 16)]];
 /// Candidates evaluated on all matches, per step.
 const EVALUATED: usize = 3;
 /// A candidate whose log₁₀ NFA in a prefix is beyond this is not evaluated,
@@ -243,8 +238,7 @@ impl<'a> Search<'a> {
             let scale = best.fit.motion.scale;
             scales = (scales.0.max(scale / RIVAL_SCALE), scales.1.min(scale * RIVAL_SCALE));
         }
-        let largest = PREFIX_LARGEST[usize::from(self.context.with_scale)];
-        let prefix = enough.max(stage.prefix).min(largest);
+        let prefix = enough.max(stage.prefix).min(largest(self.context.with_scale));
         self.step(&pool, Stage { prefix, level: stage.level }, scales, bar, Some(&taken))
     }
 
@@ -276,11 +270,15 @@ impl<'a> Search<'a> {
 /// Growing prefixes, each at every σ level, cheapest and likeliest first.
 fn stages(n: usize, with_scale: bool) -> Vec<Stage> {
     let kind = usize::from(with_scale);
-    let n = n.min(PREFIX_LARGEST[kind]);
-    let growing = core::iter::successors(Some(PREFIX_FIRST), |p| p.checked_mul(PREFIX_GROWTH[kind]));
-    let prefixes = growing.take_while(|p| p * 3 / 2 < n).chain([n]);
-    let mut stages: Vec<Stage> =
-        prefixes.flat_map(|prefix| (0..LEVELS).map(move |level| Stage { prefix, level })).collect();
-    stages.sort_by_key(|s| s.prefix * LEVEL_COSTS[s.level as usize]);
-    stages
+    let n = n.min(largest(with_scale));
+    let prefixes = PREFIXES[kind].iter().copied().take_while(|p| p * 3 / 2 < n).chain([n]);
+    let costs = |prefix| LEVELS[kind].iter().map(move |&(level, cost)| (prefix * cost, Stage { prefix, level }));
+    let mut stages: Vec<(usize, Stage)> = prefixes.flat_map(costs).collect();
+    stages.sort_by_key(|(cost, _)| *cost);
+    stages.into_iter().map(|(_, stage)| stage).collect()
+}
+
+/// The largest prefix searched.
+fn largest(with_scale: bool) -> usize {
+    PREFIXES[usize::from(with_scale)].last().copied().unwrap_or(0)
 }

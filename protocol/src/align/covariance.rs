@@ -9,6 +9,7 @@
 //! estimated from ν = 3 Σp − dof residuals.
 
 use super::Weighting;
+use super::noise;
 use super::refine::{Context, Fit};
 use crate::geometry::so3::hat;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
@@ -44,6 +45,9 @@ struct Information {
 
 /// The estimate of a fit; `None` where a rotation or the scale is wholly undetermined.
 pub(super) fn estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
+    if fit.shapes.is_some() {
+        return shaped_estimate(context, fit);
+    }
     let information = information(context, fit);
     let axes = information.rotation.symmetric_eigen();
     let weakest = axes.eigenvalues.min();
@@ -61,28 +65,80 @@ pub(super) fn estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
         eigenvalues.push(information.scale);
     }
     eigenvalues.sort_unstable_by(f64::total_cmp);
+    let mut local = SMatrix::<f64, 7, 7>::zeros();
+    local.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(translation);
+    local.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
+    local[(6, 6)] = inflation / information.scale;
+    let relative = carried(context, fit, &local, &information.centroid)?;
+    Some(Estimate { relative, eigenvalues, rotation_sigma: (inflation / weakest).sqrt() })
+}
+
+/// The estimate where residuals have covariances of their own: the information is Σ w Jᵀ C⁻¹ J / σ̂², and does not fall apart.
+fn shaped_estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
+    let shapes = fit.shapes.as_ref()?;
+    let (weights, total, honest) = honest_weights(context, fit);
+    let source = &context.matches.source;
+    let centroid = weights.iter().map(|(i, w)| source[*i] * *w).sum::<Vector3<f64>>() / total;
+    let mut information = SMatrix::<f64, 7, 7>::zeros();
+    for (i, w) in &weights {
+        let j = noise::jacobian(&fit.motion, &(source[*i] - centroid));
+        information += j.transpose() * (shapes.precision[*i] * *w) * j;
+    }
+    information *= motion_gain(1.0, fit.motion.residual_unit(), fit.sigma * fit.sigma) * honest;
+    if !context.with_scale {
+        information.row_mut(6).fill(0.0);
+        information.column_mut(6).fill(0.0);
+        information[(6, 6)] = 1.0;
+    }
+    let inflation = inflation(3.0 * fit.support() - context.dof(), context.with_scale);
+    let local = information.cholesky()?.inverse() * inflation;
+    let widest = local.fixed_view::<3, 3>(3, 3).into_owned().symmetric_eigenvalues().max();
+    let relative = carried(context, fit, &local, &centroid)?;
+    let mut eigenvalues: Vec<f64> = if context.with_scale {
+        information.symmetric_eigenvalues().iter().copied().collect()
+    } else {
+        information.fixed_view::<6, 6>(0, 0).into_owned().symmetric_eigenvalues().iter().copied().collect()
+    };
+    eigenvalues.sort_unstable_by(f64::total_cmp);
+    let determined = eigenvalues[0] > 0.0 && widest.is_finite();
+    determined.then(|| Estimate { relative, eigenvalues, rotation_sigma: widest.sqrt() })
+}
+
+/// The motion with a covariance that is known about the inliers' centroid.
+fn carried(context: &Context, fit: &Fit, local: &SMatrix<f64, 7, 7>, centroid: &Vector3<f64>) -> Option<Relative> {
     let motion = &fit.motion;
     // x ↦ target_centre + motion(x − source_centre)
     let turned = motion.rotation * context.matches.source_centre * motion.scale;
     let moved = context.matches.target_centre + motion.translation - turned;
-    let centre = context.matches.source_centre + information.centroid;
+    let centre = context.matches.source_centre + centroid;
     let so3 = So3::from_matrix(&motion.rotation);
-    let relative = if context.with_scale {
-        let scale = inflation / information.scale;
+    Some(if context.with_scale {
         let sim = Sim3::new(so3, moved, motion.scale);
-        Relative::Similarity(SimWithCovariance {
-            sim,
-            covariance: carried_sim(translation, &rotation, scale, &centre)?,
-        })
+        Relative::Similarity(SimWithCovariance { sim, covariance: carried_sim(local, &centre)? })
     } else {
         let pose = Se3::new(so3, moved);
-        Relative::Metric(PoseWithCovariance { pose, covariance: carried_pose(translation, &rotation, &centre)? })
-    };
-    Some(Estimate { relative, eigenvalues, rotation_sigma: (inflation / weakest).sqrt() })
+        let local = local.fixed_view::<6, 6>(0, 0).into_owned();
+        Relative::Metric(PoseWithCovariance { pose, covariance: carried_pose(&local, &centre)? })
+    })
 }
 
 fn information(context: &Context, fit: &Fit) -> Information {
-    let unit = fit.motion.residual_unit();
+    let (weights, total, honest) = honest_weights(context, fit);
+    let source = &context.matches.source;
+    let centroid = weights.iter().map(|(i, w)| source[*i] * *w).sum::<Vector3<f64>>() / total;
+    let (mut scatter, mut spread) = (Matrix3::zeros(), 0.0);
+    for (i, w) in &weights {
+        let x = source[*i] - centroid;
+        scatter += x * x.transpose() * *w;
+        spread += x.norm_squared() * *w;
+    }
+    let k = motion_gain(fit.motion.scale, fit.motion.residual_unit(), fit.sigma * fit.sigma) * honest;
+    let rotation = (Matrix3::identity() * spread - scatter) * k;
+    Information { centroid, translation: total * k, rotation, scale: spread * k }
+}
+
+/// How much each match informs, the sum, and the factor by which all do so less, or little more, than that.
+fn honest_weights(context: &Context, fit: &Fit) -> (Vec<(usize, f64)>, f64, f64) {
     let variance = fit.sigma * fit.sigma;
     let mut weights = slopes(fit);
     let plain: f64 = fit.support();
@@ -96,17 +152,7 @@ fn information(context: &Context, fit: &Fit) -> Information {
     let freedom = (3.0 * plain - context.dof()).max(FREEDOM_MIN);
     let scatter_of_influence = weights.iter().map(|(i, _)| influence(*i)).sum::<f64>() / (3.0 * variance);
     let honest = total / (scatter_of_influence * 3.0 * plain / freedom).max(HONEST_MIN * total);
-    let source = &context.matches.source;
-    let centroid = weights.iter().map(|(i, w)| source[*i] * *w).sum::<Vector3<f64>>() / total;
-    let (mut scatter, mut spread) = (Matrix3::zeros(), 0.0);
-    for (i, w) in &weights {
-        let x = source[*i] - centroid;
-        scatter += x * x.transpose() * *w;
-        spread += x.norm_squared() * *w;
-    }
-    let k = motion_gain(fit.motion.scale, unit, variance) * honest;
-    let rotation = (Matrix3::identity() * spread - scatter) * k;
-    Information { centroid, translation: total * k, rotation, scale: spread * k }
+    (weights, total, honest)
 }
 
 /// Matches of positive probability with the mean slope of their influence.
@@ -141,20 +187,13 @@ fn motion_gain(scale: f64, unit: f64, variance: f64) -> f64 {
 }
 
 /// Ad of a translation by `c` maps the perturbation about c to the one about the origin: ρ₀ = ρ + c × φ (− c λ).
-fn carried_pose(translation: f64, rotation: &Matrix3<f64>, c: &Vector3<f64>) -> Option<Covariance<6>> {
-    let mut local = Matrix6::zeros();
-    local.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(translation);
-    local.fixed_view_mut::<3, 3>(3, 3).copy_from(rotation);
+fn carried_pose(local: &Matrix6<f64>, c: &Vector3<f64>) -> Option<Covariance<6>> {
     let mut ad = Matrix6::identity();
     ad.fixed_view_mut::<3, 3>(0, 3).copy_from(&hat(c));
     representable(ad * local * ad.transpose())
 }
 
-fn carried_sim(translation: f64, rotation: &Matrix3<f64>, scale: f64, c: &Vector3<f64>) -> Option<Covariance<7>> {
-    let mut local = SMatrix::<f64, 7, 7>::zeros();
-    local.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(translation);
-    local.fixed_view_mut::<3, 3>(3, 3).copy_from(rotation);
-    local[(6, 6)] = scale;
+fn carried_sim(local: &SMatrix<f64, 7, 7>, c: &Vector3<f64>) -> Option<Covariance<7>> {
     let mut ad = SMatrix::<f64, 7, 7>::identity();
     ad.fixed_view_mut::<3, 3>(0, 3).copy_from(&hat(c));
     ad.fixed_view_mut::<3, 1>(0, 6).copy_from(&-c);

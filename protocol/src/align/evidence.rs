@@ -28,8 +28,9 @@ pub(super) fn log_peak(sigma: f64, volume: f64) -> f64 {
 }
 
 /// The evidence of squared residuals, ascending, of which only the small ones need be given; `n` counts all matches.
-/// `None` where fewer than 4 lie near for every σ.
-pub(super) fn evidence(squared: &[f64], n: usize, sigma_max: f64, volume: f64) -> Option<Mixture> {
+/// `None` where fewer than 4 lie near for every σ. `log_roots`, if any, are ½ ln det of each residual's normalised
+/// covariance, by which its Gaussian is flatter.
+pub(super) fn evidence(squared: &[f64], log_roots: &[f64], n: usize, sigma_max: f64, volume: f64) -> Option<Mixture> {
     let n = n as f64;
     let step = libm::pow(SIGMA_SPAN, 1.0 / (SIGMAS - 1) as f64);
     let mut best: Option<(f64, f64, f64)> = None;
@@ -40,7 +41,7 @@ pub(super) fn evidence(squared: &[f64], n: usize, sigma_max: f64, volume: f64) -
         let near = gate(11.345);
         if near >= 4 {
             let close = &squared[..gate(2.0 * EXPONENT_MAX)];
-            let (value, share) = profile(close, near, n, sigma, log_peak(sigma, volume));
+            let (value, share) = profile(close, log_roots, near, n, sigma, log_peak(sigma, volume));
             *slot = value;
             if best.is_none_or(|b| value > b.0) {
                 best = Some((value, sigma, share));
@@ -54,7 +55,7 @@ pub(super) fn evidence(squared: &[f64], n: usize, sigma_max: f64, volume: f64) -
 }
 
 /// Log-likelihood at one σ, ε by two EM steps.
-fn profile(close: &[f64], near: usize, n: f64, sigma: f64, log_peak: f64) -> (f64, f64) {
+fn profile(close: &[f64], log_roots: &[f64], near: usize, n: f64, sigma: f64, log_peak: f64) -> (f64, f64) {
     let bounded = |share: f64| share.clamp(1.5 / n, 0.98_f64.max(1.5 / n));
     let mut share = bounded(near as f64 / n).min(0.98);
     let inverse = 0.5 / (sigma * sigma);
@@ -63,10 +64,15 @@ fn profile(close: &[f64], near: usize, n: f64, sigma: f64, log_peak: f64) -> (f6
         let odds = share / (1.0 - share);
         let mut posterior = 0.0;
         value = n * log(1.0 - share);
-        for r2 in close {
-            let l = exp(log_peak - r2 * inverse) * odds;
+        let mut add = |log_ratio: f64| {
+            let l = exp(log_ratio) * odds;
             value += log1p(l);
             posterior += l / (1.0 + l);
+        };
+        if log_roots.is_empty() {
+            close.iter().for_each(|r2| add(log_peak - r2 * inverse));
+        } else {
+            close.iter().zip(log_roots).for_each(|(r2, log_root)| add(log_peak - log_root - r2 * inverse));
         }
         let next = bounded(posterior / n).min(0.98);
         if (next - share).abs() < 1e-3 * share {

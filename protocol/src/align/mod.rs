@@ -2,8 +2,8 @@
 //! similarity with a calibrated covariance, or to a refusal that says why.
 //!
 //! The noise scale σ is not told, only bounded by `sigma_max`; it is marginalised in each step (MATH §4):
-//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree (`graph`; for SIM(3) at one scale,
-//!    `scales`), ranked by how many further matches agree with them, on nested prefixes of the matches (best scores first)
+//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree (`graph`; for SIM(3) from matches that agree
+//!    about a pair, at one scale, `scales`, and on one turn, `turns`), ranked by how many further matches agree with them, on nested prefixes of the matches (best scores first)
 //!    and σ levels from tight to loose; `tally` prescores each by its own number of false alarms over all radii.
 //! 2. `evidence` starts the refinement at the σ of highest evidence, of a Gaussian-inlier, uniform-outlier mixture.
 //! 3. `refine` polishes by expectation-maximisation, then by the kernel density weights S(12)–S(30) of [`sigma`] where
@@ -11,6 +11,8 @@
 //! 4. `accept` admits by number of false alarms (`chance` measures what chance does), never by evidence; a disjoint rival
 //!    makes the answer ambiguous.
 //! 5. `covariance` states what is known, and refuses geometry that leaves a direction undetermined.
+//!
+//! Points may have covariances of their own (`noise`): search and prescore go by a typical one, all later steps by each.
 //!
 //! Everything is a function of the *set* of matches and the seed: matches are sorted first, so their order changes
 //! nothing, to the bit.
@@ -22,6 +24,7 @@ mod covariance;
 mod density;
 mod evidence;
 mod graph;
+mod noise;
 mod prepare;
 mod refine;
 mod sample;
@@ -31,10 +34,12 @@ mod solve;
 mod tally;
 #[cfg(test)]
 mod tests;
+mod turns;
 
-use crate::geometry::Relative;
+use crate::geometry::{Covariance, Relative};
 use crate::wire::fact::RefusalReason;
 pub use consensus::{SigmaConsensus, align};
+pub use noise::CONDITION_MAX;
 use thiserror::Error;
 
 /// Matches a problem may hold; [`SolverConfig::points_max`] may lower it.
@@ -43,7 +48,10 @@ pub const POINTS_LIMIT: usize = 65_535;
 pub const COORDINATE_MAX: f64 = 1e9;
 
 /// Matched points: `target[i]` is thought to be the place of `source[i]`, most often wrongly.
-#[derive(Clone, Copy, Debug)]
+///
+/// Covariances of the points' noise, where stated, need be known up to one common factor only: it is the σ that is
+/// marginalised. σ̂ is then the standard deviation per axis of the match of median covariance (at scale 1).
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Problem<'a> {
     /// Points in the source frame.
     pub source: &'a [[f64; 3]],
@@ -51,6 +59,10 @@ pub struct Problem<'a> {
     pub target: &'a [[f64; 3]],
     /// How trustworthy each match is, higher is better; only their order matters. Good matches are tried first.
     pub scores: Option<&'a [f64]>,
+    /// Covariance of each source point, in the source frame; without it, the sources count as exact.
+    pub source_covariances: Option<&'a [Covariance<3>]>,
+    /// Covariance of each target point, in the target frame; without it and the former, all noise is alike.
+    pub target_covariances: Option<&'a [Covariance<3>]>,
 }
 
 /// What kind of motion is sought.
@@ -225,6 +237,24 @@ pub enum AlignError {
         target_len: usize,
         /// Scores, if any.
         scores_len: Option<usize>,
+    },
+    /// Covariances, but not one for each match.
+    #[error("{covariances} {side} covariances for {matches} matches: send one of each")]
+    CovarianceCount {
+        /// `source` or `target`.
+        side: &'static str,
+        /// Covariances sent.
+        covariances: usize,
+        /// Matches sent.
+        matches: usize,
+    },
+    /// Covariances of one side whose variances differ by more than [`CONDITION_MAX`].
+    #[error("variances of {side} points differ by a factor {ratio:.1e}, 1e8 at most: widen the smallest")]
+    CovarianceRange {
+        /// `source` or `target`.
+        side: &'static str,
+        /// Largest variance in any direction, over the smallest.
+        ratio: f64,
     },
     /// Too many matches.
     #[error("{len} matches exceed the limit of {max}: send the best-scored ones")]

@@ -2,7 +2,9 @@
 //! exact duplicates merged, centred on medians, best scores first.
 
 use super::chance::Chance;
-use super::{AlignError, COORDINATE_MAX, Problem, SolverConfig};
+use super::noise::PointNoise;
+use super::{AlignError, CONDITION_MAX, COORDINATE_MAX, Problem, SolverConfig};
+use crate::geometry::Covariance;
 use core::cmp::Ordering;
 use core::ops::Range;
 use nalgebra::{Matrix3, Vector3};
@@ -30,6 +32,8 @@ pub(super) struct Matches {
     pub target_extent: [f64; 3],
     /// How often its matches agree by chance.
     pub chance: Chance,
+    /// The points' own covariances, if stated.
+    pub noise: Option<PointNoise>,
 }
 
 impl Matches {
@@ -64,8 +68,10 @@ pub(super) fn prepare(problem: &Problem, config: &SolverConfig) -> Result<Matche
     let centred = |points: &[[f64; 3]], centre| points.iter().map(|&p| Vector3::from(p) - centre).collect::<Vec<_>>();
     let (source, target) = (centred(&source, source_centre), centred(&target, target_centre));
     let target_extent = extent(&target);
+    let chosen = classes.iter().map(|class| order[class.start as usize] as usize);
     Ok(Matches {
         chance: Chance::measure(&source, &target, config.model.scale_range(), target_extent, &mut rng),
+        noise: PointNoise::of(problem, chosen),
         target_extent,
         repeats: sources.min(targets) < source.len(),
         inliers_max: sources.min(targets),
@@ -86,6 +92,11 @@ fn check(problem: &Problem, config: &SolverConfig) -> Result<(), AlignError> {
     if source_len != target_len || scores_len.is_some_and(|l| l != source_len) {
         return Err(AlignError::LengthMismatch { source_len, target_len, scores_len });
     }
+    for (side, given) in [("source", problem.source_covariances), ("target", problem.target_covariances)] {
+        if let Some(given) = given {
+            check_covariances(side, given, source_len)?;
+        }
+    }
     if source_len > config.points_max {
         return Err(AlignError::TooManyPoints { len: source_len, max: config.points_max });
     }
@@ -101,6 +112,21 @@ fn check(problem: &Problem, config: &SolverConfig) -> Result<(), AlignError> {
     }
 }
 
+/// One each, and none so much narrower than another that rounding would decide.
+fn check_covariances(side: &'static str, given: &[Covariance<3>], matches: usize) -> Result<(), AlignError> {
+    if given.len() != matches {
+        return Err(AlignError::CovarianceCount { side, covariances: given.len(), matches });
+    }
+    let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
+    for covariance in given {
+        let variances = covariance.matrix().symmetric_eigenvalues();
+        (least, most) = (least.min(variances.min()), most.max(variances.max()));
+    }
+    let ratio = if least > 0.0 { most / least } else { f64::INFINITY };
+    let fits = given.is_empty() || ratio <= CONDITION_MAX;
+    if fits { Ok(()) } else { Err(AlignError::CovarianceRange { side, ratio }) }
+}
+
 /// −0 becomes 0, so that equal points compare equal.
 fn normal(p: [f64; 3]) -> [f64; 3] {
     p.map(|x| x + 0.0)
@@ -108,6 +134,12 @@ fn normal(p: [f64; 3]) -> [f64; 3] {
 
 fn compare(a: &[f64; 3], b: &[f64; 3]) -> Ordering {
     a.iter().zip(b).map(|(x, y)| x.total_cmp(y)).find(|o| o.is_ne()).unwrap_or(Ordering::Equal)
+}
+
+fn compare_covariances(a: &Covariance<3>, b: &Covariance<3>) -> Ordering {
+    let (a, b) = (a.matrix(), b.matrix());
+    let elements = a.iter().zip(b.iter()).map(|(x, y)| (x + 0.0).total_cmp(&(y + 0.0)));
+    elements.fold(a.trace().total_cmp(&b.trace()), Ordering::then)
 }
 
 /// Input indices, identical matches adjacent, and the ranges of identical ones: best score first, equal scores shuffled
@@ -119,8 +151,17 @@ fn search_order(problem: &Problem, rng: &mut ChaCha8Rng) -> (Vec<u32>, Vec<Range
         let ((p, q), (r, s)) = (points(a), points(b));
         compare(&p, &r).then_with(|| compare(&q, &s))
     };
+    // Of matches of the same points the one of the best score stands for all; of equal ones that of the narrower noise.
+    let wider = |a: u32, b: u32| {
+        let sides = [problem.source_covariances, problem.target_covariances];
+        let compared = sides.into_iter().flatten().map(|c| compare_covariances(&c[a as usize], &c[b as usize]));
+        compared.fold(Ordering::Equal, Ordering::then)
+    };
     let mut order: Vec<u32> = (0..problem.source.len() as u32).collect();
-    order.sort_unstable_by(|&a, &b| same(a, b).then_with(|| score(b).total_cmp(&score(a))).then(a.cmp(&b)));
+    order.sort_unstable_by(|&a, &b| {
+        let first = same(a, b).then_with(|| score(b).total_cmp(&score(a)));
+        first.then_with(|| wider(a, b)).then(a.cmp(&b))
+    });
     let mut classes: Vec<Range<u32>> = Vec::with_capacity(order.len());
     let mut start = 0;
     for class in order.chunk_by(|&a, &b| same(a, b).is_eq()) {
@@ -151,6 +192,13 @@ fn point_ids(points: &[[f64; 3]]) -> (Vec<u32>, usize) {
         count += 1;
     }
     (ids, count as usize)
+}
+
+/// The upper median; 1 of nothing.
+pub(super) fn median_of(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    let middle = values.len() / 2;
+    if values.is_empty() { 1.0 } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
 /// Coordinate-wise median: a centre that no far outlier moves.

@@ -3,6 +3,7 @@
 
 use super::Weighting;
 use super::evidence::{self, EXPONENT_MAX, SIGMA_SPAN};
+use super::noise::{self, Shapes};
 use super::prepare::Matches;
 use super::sigma::NormDensity;
 use super::solve::{self, Motion};
@@ -51,8 +52,10 @@ pub(super) struct Fit {
     pub inlier_share: f64,
     /// Inlier probability per match.
     pub probabilities: Vec<f64>,
-    /// Squared residual per match, divided by the squared residual unit.
+    /// Squared residual per match, divided by the squared residual unit; with covariances, Mahalanobis distance.
     pub squared: Vec<f64>,
+    /// The residuals' normalised covariances, if not all alike.
+    pub shapes: Option<Shapes>,
     pub weighting: Weighting,
 }
 
@@ -61,6 +64,11 @@ impl Fit {
     pub fn support(&self) -> f64 {
         self.probabilities.iter().sum()
     }
+
+    /// How much larger than a sphere a typical region of given Mahalanobis distance is.
+    pub fn region(&self) -> f64 {
+        self.shapes.as_ref().map_or(1.0, |s| s.volume)
+    }
 }
 
 /// Buffers that refinement reuses.
@@ -68,38 +76,51 @@ impl Fit {
 pub(super) struct Scratch {
     order: Vec<u32>,
     sorted: Vec<f64>,
+    log_roots: Vec<f64>,
     source_used: Vec<bool>,
     target_used: Vec<bool>,
     density: NormDensity,
     trial: Vec<f64>,
 }
 
-/// Squared residuals in units of the residual unit.
-pub(super) fn squared_residuals(matches: &Matches, motion: &Motion, out: &mut Vec<f64>) {
+/// Squared residuals in units of the residual unit; with covariances, their shapes and squared Mahalanobis distances.
+fn squared_residuals(matches: &Matches, motion: &Motion, out: &mut Vec<f64>) -> Option<Shapes> {
     let unit = motion.residual_unit();
     let inverse = 1.0 / (unit * unit);
     let a = motion.rotation * motion.scale;
     out.clear();
-    let pairs = matches.source.iter().zip(&matches.target);
-    out.extend(pairs.map(|(p, q)| (q - (a * p + motion.translation)).norm_squared() * inverse));
+    let residuals = matches.source.iter().zip(&matches.target).map(|(p, q)| q - (a * p + motion.translation));
+    let Some(noise) = &matches.noise else {
+        out.extend(residuals.map(|r| r.norm_squared() * inverse));
+        return None;
+    };
+    let shapes = noise.shapes(motion);
+    out.extend(residuals.zip(&shapes.precision).map(|(r, precision)| r.dot(&(precision * r)) * inverse));
+    Some(shapes)
 }
 
 /// EM from `start`; `None` if the consensus dissolves.
 pub(super) fn em(context: &Context, start: Motion, scratch: &mut Scratch) -> Option<Fit> {
     let n = context.matches.len();
     let mut squared = Vec::with_capacity(n);
-    squared_residuals(context.matches, &start, &mut squared);
+    let shapes = squared_residuals(context.matches, &start, &mut squared);
     let reach = 2.0 * EXPONENT_MAX * context.sigma_max * context.sigma_max;
     scratch.sorted.clear();
-    scratch.sorted.extend(squared.iter().filter(|r2| **r2 < reach));
-    scratch.sorted.sort_unstable_by(f64::total_cmp);
-    let mixture = evidence::evidence(&scratch.sorted, n, context.sigma_max, context.volume)?;
+    scratch.log_roots.clear();
+    if let Some(shapes) = &shapes {
+        sort_with_shapes(&squared, reach, shapes, scratch);
+    } else {
+        scratch.sorted.extend(squared.iter().filter(|r2| **r2 < reach));
+        scratch.sorted.sort_unstable_by(f64::total_cmp);
+    }
+    let mixture = evidence::evidence(&scratch.sorted, &scratch.log_roots, n, context.sigma_max, context.volume)?;
     let mut fit = Fit {
         motion: start,
         sigma: mixture.sigma,
         inlier_share: mixture.inlier_share,
         probabilities: vec![0.0; n],
         squared,
+        shapes,
         weighting: Weighting::Em,
     };
     let mut support = 0.0;
@@ -113,6 +134,15 @@ pub(super) fn em(context: &Context, start: Motion, scratch: &mut Scratch) -> Opt
         }
     }
     Some(fit)
+}
+
+/// Fills `sorted` with the squares below `reach`, ascending, and `log_roots` with what belongs to each.
+fn sort_with_shapes(squared: &[f64], reach: f64, shapes: &Shapes, scratch: &mut Scratch) {
+    scratch.order.clear();
+    scratch.order.extend((0..squared.len() as u32).filter(|&i| squared[i as usize] < reach));
+    scratch.order.sort_unstable_by(|&a, &b| squared[a as usize].total_cmp(&squared[b as usize]).then(a.cmp(&b)));
+    scratch.sorted.extend(scratch.order.iter().map(|&i| squared[i as usize]));
+    scratch.log_roots.extend(scratch.order.iter().map(|&i| shapes.log_root[i as usize]));
 }
 
 /// Inlier posteriors at the fit's σ and ε.
@@ -129,6 +159,12 @@ fn posteriors(context: &Context, fit: &mut Fit, scratch: &mut Scratch) {
             0.0
         };
     }
+    if let Some(shapes) = &fit.shapes {
+        // l / (1 + l) with l divided by √det C.
+        for (p, log_root) in fit.probabilities.iter_mut().zip(&shapes.log_root).filter(|(p, _)| **p > 0.0) {
+            *p /= *p + (1.0 - *p) * exp(*log_root);
+        }
+    }
     one_to_one(context.matches, fit, scratch);
 }
 
@@ -140,12 +176,16 @@ fn update(context: &Context, fit: &mut Fit) -> Option<()> {
         return None;
     }
     let matches = context.matches;
-    let motion = solve::weighted(&matches.source, &matches.target, &fit.probabilities, context.with_scale)?;
+    let (p, q, weights) = (&matches.source, &matches.target, &fit.probabilities);
+    let motion = match &fit.shapes {
+        None => solve::weighted(p, q, weights, context.with_scale)?,
+        Some(shapes) => noise::refit(p, q, weights, shapes, fit.motion, context.with_scale)?,
+    };
     if !(context.scale_range.0..=context.scale_range.1).contains(&motion.scale) {
         return None;
     }
     fit.motion = motion;
-    squared_residuals(matches, &motion, &mut fit.squared);
+    fit.shapes = squared_residuals(matches, &motion, &mut fit.squared);
     let sum: f64 = fit.probabilities.iter().zip(&fit.squared).filter(|(p, _)| **p > 0.0).map(|(p, r2)| p * r2).sum();
     let freedom = (3.0 * support - context.dof()).max(2.0);
     fit.sigma = (sum / freedom).sqrt().clamp(context.sigma_max / SIGMA_SPAN, context.sigma_max);
@@ -196,14 +236,14 @@ fn kernel_density(context: &Context, start: &Fit, scratch: &mut Scratch) -> Opti
     for _ in 0..KDE_ITERATIONS {
         let inside = gather(&fit, scratch);
         let (n, spread) = (fit.squared.len() as f64, CHI3_SPREAD * fit.sigma);
-        let share = inside as f64 / n;
+        let (share, volume) = (inside as f64 / n, context.volume / fit.region());
         scratch.trial.clear();
         scratch.trial.resize(fit.squared.len(), 0.0);
         let mut ceiling = 1.0_f64;
         for (k, &i) in scratch.order.iter().enumerate() {
             let r = fit.squared[i as usize].sqrt();
             let density = share * scratch.density.at_sample(k, spread);
-            let shell = outlier_shell(r.max(0.5 * fit.sigma), (1.0 - fit.inlier_share).max(1e-3), context.volume);
+            let shell = outlier_shell(r.max(0.5 * fit.sigma), (1.0 - fit.inlier_share).max(1e-3), volume);
             let p = if density > 0.0 { (1.0 - shell / density).clamp(0.0, 1.0) } else { 0.0 };
             if r >= fit.sigma {
                 ceiling = ceiling.min(p);
@@ -241,6 +281,7 @@ fn held_out_gain(context: &Context, fit: &Fit, scratch: &mut Scratch) -> f64 {
     let n = fit.squared.len() as f64;
     let spread = CHI3_SPREAD * fit.sigma;
     let freedom = (3.0 * fit.support() - context.dof()).max(2.0);
+    let volume = context.volume / fit.region();
     let mut gain = 0.0;
     for (k, &i) in scratch.order.iter().enumerate() {
         let (r2, p) = (fit.squared[i as usize], fit.probabilities[i as usize]);
@@ -250,7 +291,7 @@ fn held_out_gain(context: &Context, fit: &Fit, scratch: &mut Scratch) -> f64 {
         let variance = fit.sigma * fit.sigma;
         let left = ((freedom * variance - p * r2) / (freedom - 3.0 * p).max(1.0)).max(0.1 * variance);
         let chi3 = (2.0 / PI).sqrt() * r2 / (left * left.sqrt()) * exp(-0.5 * r2 / left);
-        let gaussian = fit.inlier_share * chi3 + outlier_shell(r, 1.0 - fit.inlier_share, context.volume);
+        let gaussian = fit.inlier_share * chi3 + outlier_shell(r, 1.0 - fit.inlier_share, volume);
         if kernel > 0.0 && gaussian > 0.0 {
             gain += log(kernel / gaussian);
         }

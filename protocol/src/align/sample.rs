@@ -3,15 +3,16 @@
 //! A rigid motion keeps lengths, so true matches are mutually compatible: they form a dense part of the compatibility
 //! graph, kept as bitsets. Edges whose ends have no more common neighbours than chance gives are dropped, and the common
 //! neighbours of the rest counted again among the rest: even ten true among a thousand matches then stand alone. For SIM(3)
-//! there is a graph per narrow bin of scale ([`super::scales`]). Each triangle's motion is worth its own number of false
-//! alarms ([`super::tally`]), is improved by reweighted solves, and spares the triangles it explains: candidates are
-//! distinct.
+//! there is a graph per narrow bin of scale ([`super::scales`]), too dense for that; there whole bundles of matches that
+//! agree about a pair take the place of triangles ([`super::turns`]). Each motion is worth its own number of false alarms
+//! ([`super::tally`]), is improved by reweighted solves, and spares the triangles it explains: candidates are distinct.
 
 use super::graph::{Cloud, Graph, common, positions, wide};
 use super::refine::Context;
 use super::scales::{Scales, Vote};
 use super::solve::{self, Motion};
 use super::tally::{Tally, Worth};
+use super::turns::{self, Noise, Turns};
 use core::cmp::Reverse;
 use nalgebra::Vector3;
 use pulp::Arch;
@@ -21,10 +22,8 @@ const EDGES_MAX: usize = 262_144;
 /// An edge is kept if its ends have this many standard deviations more common neighbours than their degrees explain, or if
 /// they share most: where nearly all matches are true, degrees explain everything.
 const EXCESS_MIN: f32 = 1.0;
-/// Edges expanded to triangles, in all graphs of a step.
+/// Edges expanded to triangles.
 const EDGES_EXPANDED: usize = 256;
-/// ...and at least, in each of them.
-const EDGES_EXPANDED_MIN: usize = 16;
 /// Triangles kept per expanded edge.
 const TRIANGLES_PER_EDGE: usize = 3;
 /// Third vertices tried per expanded edge; beyond, an even selection.
@@ -35,6 +34,12 @@ pub(super) const CANDIDATES_MAX: usize = 6;
 const LENGTH_GATE: f64 = 2.0;
 /// A triangle's height over its longest edge, in σ, from which its motion is worth something.
 const HEIGHT_MIN: f64 = 3.0;
+/// Members of a bundle farther than so many σ from its motion are dropped,
+const TRIM_GATE: f64 = 4.0;
+/// unless the mean squared distance is this much larger yet: then its motion is still too far off to tell.
+const TRIM_SHARE: f64 = 0.5;
+/// Times that is done.
+const TRIMS: usize = 3;
 /// A hypothesis is improved if its NFA is within this factor (ln) of the best raw one so far.
 const RAW_MARGIN: f64 = 7.0;
 /// Reweighted solves of a hypothesis, at most.
@@ -72,6 +77,9 @@ pub(super) struct Sampler {
     cloud: Cloud,
     tally: Tally,
     scales: Scales,
+    turns: Turns,
+    /// The pairs that bundles are sought about.
+    seeds: Graph,
     graph: Graph,
     /// The edges of `graph` with more common neighbours than chance gives.
     kept: Graph,
@@ -105,6 +113,20 @@ struct Triangle {
     vertices: [u32; 3],
 }
 
+/// What was tried so far.
+#[derive(Clone, Copy, Debug)]
+struct Race {
+    tried: usize,
+    best_raw: f64,
+    best: Worth,
+}
+
+impl Default for Race {
+    fn default() -> Self {
+        Self { tried: 0, best_raw: f64::NEG_INFINITY, best: Worth::default() }
+    }
+}
+
 impl Default for Sampler {
     fn default() -> Self {
         Self {
@@ -112,6 +134,8 @@ impl Default for Sampler {
             cloud: Cloud::default(),
             tally: Tally::default(),
             scales: Scales::default(),
+            turns: Turns::default(),
+            seeds: Graph::default(),
             graph: Graph::default(),
             kept: Graph::default(),
             degrees: Vec::new(),
@@ -144,38 +168,56 @@ impl Sampler {
             let per_scale = tolerance * context.sigma_max / step.sigma;
             let vote = Vote { range: step.scales, tolerance, tolerance_per_scale: per_scale };
             self.scales.measure(self.arch, &self.cloud, &vote);
-            let bins = self.scales.bins();
-            for bin in 0..bins {
-                self.scales.build(self.arch, bin, self.cloud.count, &mut self.graph);
-                self.find_triangles((EDGES_EXPANDED / bins).max(EDGES_EXPANDED_MIN));
-            }
+            self.find_bundles(context, step);
+            self.try_bundles(context, step, out);
         } else {
             let ratio = self.cloud.source_unit / self.cloud.unit;
             let tolerance = tolerance / self.cloud.unit;
             self.graph.build_rigid(self.arch, &self.cloud, ratio as f32, tolerance as f32);
-            self.find_triangles(EDGES_EXPANDED);
-        }
-        self.triangles.sort_unstable();
-        self.triangles.dedup();
-        self.try_triangles(context, step, true, out);
-        if out.is_empty() {
-            self.try_triangles(context, step, false, out);
+            self.find_triangles();
+            self.try_triangles(context, step, true, out);
+            if out.is_empty() {
+                self.try_triangles(context, step, false, out);
+            }
         }
         out.sort_by(|a, b| b.worth.score.total_cmp(&a.worth.score));
     }
 
-    /// Adds the triangles of the graph's `expanded` best edges.
-    fn find_triangles(&mut self, expanded: usize) {
+    /// The triangles of the graph's best edges, most surprising first.
+    fn find_triangles(&mut self) {
         let arch = self.arch;
         wide(
             arch,
             #[inline(always)]
             || {
                 self.keep_edges();
-                self.rank_edges(expanded);
+                self.rank_edges();
                 self.expand_edges();
             },
         );
+        self.triangles.sort_unstable();
+        self.triangles.dedup();
+    }
+
+    /// The bundles of all scales, most surprising first.
+    fn find_bundles(&mut self, context: &Context, step: &Step) {
+        self.turns.clear();
+        let noise = Noise {
+            sigma: (step.sigma / self.cloud.unit) as f32,
+            sigma_per_scale: (context.sigma_max / self.cloud.source_unit) as f32,
+        };
+        let bins = self.scales.bins();
+        for bin in 0..bins {
+            self.scales.build(self.arch, bin, self.cloud.count, &mut self.graph);
+            self.scales.build_seeds(self.arch, bin, self.cloud.count, &mut self.seeds);
+            let (cloud, turns, graph, seeds) = (&self.cloud, &mut self.turns, &self.graph, &self.seeds);
+            wide(
+                self.arch,
+                #[inline(always)]
+                || turns.find(cloud, noise, graph, seeds, Turns::pairs_of(bins)),
+            );
+        }
+        self.turns.bundles.sort_unstable();
     }
 
     /// Keeps the edges whose ends have more common neighbours than chance gives.
@@ -213,14 +255,14 @@ impl Sampler {
 
     /// The kept edges whose ends have the most common neighbours among kept edges.
     #[inline(always)]
-    fn rank_edges(&mut self, expanded: usize) {
+    fn rank_edges(&mut self) {
         for edge in &mut self.edges {
             edge.kept = Reverse(common(self.kept.row(edge.i as usize), self.kept.row(edge.j as usize)));
         }
         self.edges.retain(|e| e.kept.0 > 0);
-        if self.edges.len() > expanded {
-            self.edges.select_nth_unstable(expanded);
-            self.edges.truncate(expanded);
+        if self.edges.len() > EDGES_EXPANDED {
+            self.edges.select_nth_unstable(EDGES_EXPANDED);
+            self.edges.truncate(EDGES_EXPANDED);
         }
     }
 
@@ -262,40 +304,100 @@ impl Sampler {
     /// Turns triangles, most supported first, into distinct candidates.
     fn try_triangles(&mut self, context: &Context, step: &Step, fat: bool, out: &mut Vec<Candidate>) {
         self.explained.clear();
-        let (mut tried, mut best_raw, mut best) = (0, f64::NEG_INFINITY, Worth::default());
+        let mut race = Race::default();
         for t in 0..self.triangles.len() {
             let triangle = self.triangles[t];
-            if tried >= step.hypotheses_max {
+            if race.tried >= step.hypotheses_max {
                 break;
             }
-            if f64::from(triangle.common.0) < COMMON_SHARE * f64::from(best.count) - 3.0 {
+            if f64::from(triangle.common.0) < COMMON_SHARE * f64::from(race.best.count) - 3.0 {
+                continue;
+            }
+            if self.explained.iter().any(|set| triangle.vertices.iter().all(|&k| holds(set, k))) {
                 continue;
             }
             let v = triangle.vertices.map(|k| k as usize);
-            if self.explained.iter().any(|set| v.iter().all(|&k| set[k / 64] >> (k % 64) & 1 == 1)) {
-                continue;
-            }
             let Some(motion) = self.minimal(context, step, v, fat) else { continue };
-            tried += 1;
-            let worth = self.cloud.worth(self.arch, context, &motion, &mut self.tally);
-            best_raw = best_raw.max(worth.score);
-            if worth.score < best_raw - RAW_MARGIN {
-                continue;
-            }
-            let candidate = self.improve(context, Candidate { motion, worth }, &[1.0]);
-            if !kept_by(out, &candidate, RAW_MARGIN) {
-                continue;
-            }
-            // A few true matches that chance ones have tilted are led out of that trap by a wider view.
-            let candidate = self.improve(context, candidate, &[1.0, 2.0]);
-            if !kept_by(out, &candidate, 0.0) {
-                continue;
-            }
-            if candidate.worth.score > best.score {
-                best = candidate.worth;
-            }
-            self.keep(candidate, out);
+            self.try_motion(context, motion, &mut race, out);
         }
+    }
+
+    /// Turns bundles, most surprising first, into distinct candidates.
+    fn try_bundles(&mut self, context: &Context, step: &Step, out: &mut Vec<Candidate>) {
+        self.explained.clear();
+        let mut race = Race::default();
+        for b in 0..self.turns.bundles.len() {
+            if race.tried >= step.hypotheses_max {
+                break;
+            }
+            let members = self.turns.members(b);
+            let (pair, thirds) = members.split_at(2);
+            let explains = |set: &Vec<u64>| {
+                pair.iter().all(|&k| holds(set, k))
+                    && 2 * thirds.iter().filter(|&&k| holds(set, k)).count() >= thirds.len()
+            };
+            if self.explained.iter().any(explains) {
+                continue;
+            }
+            let Some(motion) = self.shared_motion(context, step, b) else { continue };
+            self.try_motion(context, motion, &mut race, out);
+        }
+    }
+
+    /// Improves a motion that is worth it, and keeps it if it is among the best.
+    fn try_motion(&mut self, context: &Context, motion: Motion, race: &mut Race, out: &mut Vec<Candidate>) {
+        race.tried += 1;
+        let worth = self.cloud.worth(self.arch, context, &motion, &mut self.tally);
+        race.best_raw = race.best_raw.max(worth.score);
+        if worth.score < race.best_raw - RAW_MARGIN {
+            return;
+        }
+        let candidate = self.improve(context, Candidate { motion, worth }, &[1.0]);
+        if !kept_by(out, &candidate, RAW_MARGIN) {
+            return;
+        }
+        // A few true matches that chance ones have tilted are led out of that trap by a wider view.
+        let candidate = self.improve(context, candidate, &[1.0, 2.0]);
+        if !kept_by(out, &candidate, 0.0) {
+            return;
+        }
+        if candidate.worth.score > race.best.score {
+            race.best = candidate.worth;
+        }
+        self.keep(candidate, out);
+    }
+
+    /// The motion of most of a bundle, if its scale is in range.
+    fn shared_motion(&self, context: &Context, step: &Step, bundle: usize) -> Option<Motion> {
+        let members = self.turns.members(bundle);
+        let (mut p, mut q) = ([Vector3::zeros(); turns::MEMBERS_MAX], [Vector3::zeros(); turns::MEMBERS_MAX]);
+        for (k, &member) in members.iter().enumerate() {
+            (p[k], q[k]) = (self.source[member as usize], self.target[member as usize]);
+        }
+        let (p, q) = (&p[..members.len()], &q[..members.len()]);
+        let (mut weights, mut squared) = ([1.0; turns::MEMBERS_MAX], [0.0; turns::MEMBERS_MAX]);
+        let (weights, squared) = (&mut weights[..members.len()], &mut squared[..members.len()]);
+        let mut motion = solve::weighted(p, q, weights, true)?;
+        let gate = TRIM_GATE * step.sigma * motion.residual_unit();
+        for _ in 0..TRIMS {
+            for k in 0..members.len() {
+                squared[k] = (q[k] - motion.apply(&p[k])).norm_squared();
+            }
+            let mean = squared.iter().sum::<f64>() / weights.iter().sum::<f64>();
+            let limit = (gate * gate).max(TRIM_SHARE * mean);
+            let mut changed = false;
+            for (weight, r2) in weights.iter_mut().zip(squared.iter()) {
+                let kept = if *r2 > limit { 0.0 } else { 1.0 };
+                changed |= kept != *weight;
+                *weight = kept;
+            }
+            if !changed {
+                break;
+            }
+            motion = solve::weighted(p, q, weights, true)?;
+        }
+        let (low, high) = context.scale_range;
+        (low..=high).contains(&motion.scale).then_some(motion)
     }
 
     /// The motion of one triangle, if its shape determines one within the scale range.
@@ -353,6 +455,11 @@ impl Sampler {
         let reach = EXPLAINED * candidate.worth.radius;
         self.cloud.near(self.arch, &candidate.motion, reach, &mut self.explained[slot]);
     }
+}
+
+/// Whether a bitset holds a number.
+fn holds(set: &[u64], k: u32) -> bool {
+    set[k as usize / 64] >> (k % 64) & 1 == 1
 }
 
 /// Whether a candidate is among the best, or would be with a score better by `margin`.

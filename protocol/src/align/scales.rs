@@ -7,10 +7,12 @@
 use super::graph::{Cloud, Graph, lengths, pack, wide};
 use pulp::Arch;
 
-/// Bins at most: a bin's number is a byte.
-const BINS_MAX: usize = 240;
+/// Bins at most; a bin's number is a byte.
+const BINS_MAX: usize = 64;
 /// Width of a bin over that of a typical pair's half vote.
-const WIDTH: f64 = 4.0;
+const WIDTH: f64 = 2.0;
+/// Length from which a pair tells its own scale, over a typical one.
+const LONG: f64 = 1.0;
 /// Pairs shorter than so many τ vote for nearly everything and are left out.
 const LENGTH_MIN: f32 = 3.0;
 /// The bins of every ordered pair.
@@ -21,6 +23,8 @@ pub(super) struct Scales {
     /// 255 for a pair that votes for nothing.
     first: Vec<u8>,
     last: Vec<u8>,
+    /// The bin of its own ratio; 255 for a pair that is too short to tell much.
+    own: Vec<u8>,
 }
 
 /// What a pair's lengths tell about scale.
@@ -42,12 +46,13 @@ struct Bins {
     root: f32,
     inverse: f32,
     top: f32,
+    long: f32,
 }
 
 impl Bins {
     /// First and last bins of 64 pairs with source lengths `d` and target lengths `e`. Without branches.
     #[inline(always)]
-    fn of(self, d: &[f32; 64], e: &[f32; 64], first: &mut [u8; 64], last: &mut [u8; 64]) {
+    fn of(self, d: &[f32; 64], e: &[f32; 64], first: &mut [u8; 64], last: &mut [u8; 64], own: &mut [u8; 64]) {
         for k in 0..64 {
             let inverse_d = 1.0 / d[k];
             let ratio = e[k] * inverse_d;
@@ -63,6 +68,11 @@ impl Bins {
             let high = if b < self.top { b } else { self.top };
             first[k] = (nearest(low) | never) as u8;
             last[k] = (nearest(high) & !never) as u8;
+            let c = (middle - self.root) * self.inverse;
+            let own_votes = votes & (d[k] >= self.long) & (c >= -0.5) & (c <= self.top + 0.5);
+            let never = u32::from(!own_votes).wrapping_neg();
+            let c = if c > 0.0 { c } else { 0.0 };
+            own[k] = (nearest(c) | never) as u8;
         }
     }
 }
@@ -86,7 +96,7 @@ impl Scales {
         let width = (WIDTH * tolerance / (2.0 * middle * typical)).max(span / (BINS_MAX - 1) as f64);
         self.bins = (span / width).ceil() as usize + 1;
         self.stride = cloud.words * 64;
-        for side in [&mut self.first, &mut self.last] {
+        for side in [&mut self.first, &mut self.last, &mut self.own] {
             side.clear();
             side.resize(cloud.count * self.stride, 0);
         }
@@ -96,18 +106,43 @@ impl Scales {
             root: low.sqrt() as f32,
             inverse: (1.0 / width) as f32,
             top: (self.bins - 1) as f32,
+            long: (LONG * typical) as f32,
         };
-        let (stride, first, last) = (self.stride, &mut self.first, &mut self.last);
+        let (stride, first, last, own) = (self.stride, &mut self.first, &mut self.last, &mut self.own);
         wide(
             arch,
             #[inline(always)]
             || {
                 let rows = first.chunks_exact_mut(stride).zip(last.chunks_exact_mut(stride));
-                for (i, (first, last)) in rows.enumerate() {
+                for (i, ((first, last), own)) in rows.zip(own.chunks_exact_mut(stride)).enumerate() {
                     let words = first.as_chunks_mut::<64>().0.iter_mut().zip(last.as_chunks_mut::<64>().0);
-                    for (w, (first, last)) in words.enumerate() {
+                    for (w, ((first, last), own)) in words.zip(own.as_chunks_mut::<64>().0).enumerate() {
                         let (d, e) = lengths(cloud, i, w * 64);
-                        bins.of(&d, &e, first, last);
+                        bins.of(&d, &e, first, last, own);
+                    }
+                }
+            },
+        );
+    }
+
+    /// Connects the pairs of which the bin is their own, each once.
+    pub fn build_seeds(&self, arch: Arch, bin: usize, count: usize, seeds: &mut Graph) {
+        seeds.count = count;
+        seeds.words = self.stride / 64;
+        seeds.rows.resize(self.own.len() / 64, 0);
+        let (bin, words) = (bin as u8, seeds.words);
+        let rows = seeds.rows.chunks_exact_mut(words.max(1)).zip(self.own.chunks_exact(self.stride.max(1)));
+        wide(
+            arch,
+            #[inline(always)]
+            || {
+                for (i, (row, own)) in rows.enumerate() {
+                    for (word, own) in row.iter_mut().zip(own.as_chunks::<64>().0).skip(i / 64) {
+                        let mut flags = [0_u8; 64];
+                        for k in 0..64 {
+                            flags[k] = u8::from(own[k] == bin);
+                        }
+                        *word = pack(&flags);
                     }
                 }
             },

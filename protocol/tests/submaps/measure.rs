@@ -43,7 +43,8 @@ pub fn trial(theirs: &Place, mine: &Place, keypoints: usize, truth: Option<&Se3>
         seed: 7,
         ..Default::default()
     };
-    let problem = Problem { source: &found.source, target: &found.target, scores: Some(&found.scores) };
+    let problem =
+        Problem { source: &found.source, target: &found.target, scores: Some(&found.scores), ..Problem::default() };
     let solved = align(&problem, &config).unwrap();
     let mut trial = Trial {
         matches: found.source.len(),

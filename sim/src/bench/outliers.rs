@@ -48,7 +48,7 @@ pub fn measure(
     let mut times = Vec::new();
     for seed in 0..count {
         let (source, target) = draw(u64::from(seed), n);
-        let problem = Problem { source: &source, target: &target, scores: None };
+        let problem = Problem { source: &source, target: &target, ..Problem::default() };
         let began = thread_seconds();
         let result = align(&problem, &config).with_context(|| format!("{n} false matches"))?;
         times.push(1e3 * (thread_seconds() - began));

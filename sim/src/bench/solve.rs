@@ -64,7 +64,7 @@ pub fn solve(corr: &Corr, sigma_max: f64, refinement: Refinement) -> anyhow::Res
         false => Model::Rigid,
     };
     let config = config(model, sigma_max, refinement);
-    let problem = Problem { source: &corr.source, target: &corr.target, scores: None };
+    let problem = Problem { source: &corr.source, target: &corr.target, ..Problem::default() };
     let began = thread_seconds();
     let result = align(&problem, &config).context("cannot be aligned")?;
     let cpu_s = thread_seconds() - began;

@@ -10,7 +10,7 @@ use proptest::prelude::*;
 fn malformed_calls_are_errors() {
     let points = [[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
     fn call(s: &[[f64; 3]], t: &[[f64; 3]], scores: Option<&[f64]>, config: &SolverConfig) -> Result<(), AlignError> {
-        align(&Problem { source: s, target: t, scores }, config).map(drop)
+        align(&Problem { source: s, target: t, scores, ..Problem::default() }, config).map(drop)
     }
     let good = config(0.1);
     assert_eq!(
@@ -159,7 +159,7 @@ proptest! {
         }
         let model = if similar { Model::Similarity { scale_min: 1e-6, scale_max: 1e-5 } } else { Model::Rigid };
         let config = SolverConfig { model, weighting, support_min: 4.0, ..config(sigma_max) };
-        let answer = align(&Problem { source: &s, target: &t, scores: None }, &config).expect("well-formed");
+        let answer = align(&Problem { source: &s, target: &t, ..Problem::default() }, &config).expect("well-formed");
         if let Ok(found) = answer {
             prop_assert!(found.sigma.is_finite() && found.support.is_finite() && found.log10_nfa.is_finite());
             prop_assert!(found.inlier_probabilities.iter().all(|p| (0.0..=1.0).contains(p)));
@@ -197,7 +197,7 @@ proptest! {
             .map(|i| if (i as f64) < true_share * n as f64 { source[i] } else { (place() * size).into() })
             .collect();
         let config = SolverConfig { model, support_min: 4.0, ..config(sigma_max) };
-        let answer = align(&Problem { source: &source, target: &target, scores: None }, &config).expect("well-formed");
+        let answer = align(&Problem { source: &source, target: &target, ..Problem::default() }, &config).expect("well-formed");
         if let Ok(found) = answer {
             prop_assert!(found.sigma.is_finite() && found.log10_nfa <= config.log10_nfa_max);
             prop_assert!(found.information_eigenvalues.iter().all(|x| x.is_finite() && *x > 0.0));
@@ -216,7 +216,7 @@ proptest! {
         let mut case = Case::uniform(7, n, n, 1.0);
         let index = at.index(n);
         if side { case.source[index][axis] = bad } else { case.target[index][axis] = bad }
-        let problem = Problem { source: &case.source, target: &case.target, scores: None };
+        let problem = Problem { source: &case.source, target: &case.target, ..Problem::default() };
         prop_assert_eq!(align(&problem, &config(0.1)), Err(AlignError::NotFinite { index }));
     }
 }

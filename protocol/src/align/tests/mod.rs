@@ -3,6 +3,7 @@
 mod calibration;
 mod hostile;
 mod recovery;
+mod shapes;
 
 use super::{Alignment, Problem, Refusal, SolverConfig, align};
 use crate::geometry::{Se3, Sim3, So3};
@@ -74,7 +75,7 @@ impl Case {
     }
 
     fn solve(&self, config: &SolverConfig) -> Result<Alignment, Refusal> {
-        let problem = Problem { source: &self.source, target: &self.target, scores: None };
+        let problem = Problem { source: &self.source, target: &self.target, ..Problem::default() };
         align(&problem, config).expect("a well-formed problem")
     }
 

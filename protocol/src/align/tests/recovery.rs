@@ -60,6 +60,22 @@ fn similarities_are_found() {
 }
 
 #[test]
+fn ten_true_of_a_thousand_are_found_at_an_unknown_scale() {
+    let model = Model::Similarity { scale_min: 0.4, scale_max: 2.5 };
+    for times in [3.0, 10.0] {
+        let mut right = 0;
+        for seed in 0..20 {
+            let case = Case::uniform(700 + seed, 1000, 10, 0.8 + 0.06 * seed as f64);
+            if let Ok(found) = case.solve(&SolverConfig { model, ..config(times * SIGMA) }) {
+                assert!(case.recovered_by(&found), "seed {seed}: {found:?}");
+                right += 1;
+            }
+        }
+        assert!(right >= 19, "{right} of 20 at {times} σ");
+    }
+}
+
+#[test]
 fn shrinking_never_wins() {
     // A tight cluster of targets would fit any source shrunk onto it.
     let mut draw = Draw::new(9);
@@ -216,7 +232,8 @@ fn good_scores_help_and_bad_scores_do_not_hurt() {
     let case = Case::uniform(4, 600, 20, 1.0);
     for sign in [1.0, -1.0] {
         let scores: Vec<f64> = (0..600).map(|i| if i < 20 { sign } else { 0.0 }).collect();
-        let problem = Problem { source: &case.source, target: &case.target, scores: Some(&scores) };
+        let problem =
+            Problem { source: &case.source, target: &case.target, scores: Some(&scores), ..Problem::default() };
         let found = align(&problem, &config(3.0 * SIGMA)).expect("well-formed").expect("20 inliers");
         assert!(case.recovered_by(&found));
     }
