@@ -18,6 +18,7 @@ mod hypothesis;
 mod measured;
 mod pairs;
 mod predict;
+mod scaled;
 #[cfg(test)]
 mod tests;
 #[doc(hidden)]
@@ -27,6 +28,7 @@ use super::trajectory::Trajectory;
 use crate::config::EstimateConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
 use measured::Measured;
+pub use scaled::SimMeasurement;
 
 /// Alignments between two frames considered at most. Of more, this many are taken evenly along the first frame: a rule
 /// deaf to what an alignment claims about itself.
@@ -84,6 +86,12 @@ pub enum FrameOutcome<T = PoseWithCovariance> {
         /// Its rival.
         rival: FrameConsensus<T>,
     },
+    /// What agrees does not give the frames' scale: no alignment measures it, and the baseline between them is too short
+    /// for the scale.
+    BaselineTooShort {
+        /// Standard deviation of log-scale that the baselines support.
+        log_scale_sigma: f64,
+    },
     /// Several alignments, and no set of them agrees better than chance.
     Inconsistent,
 }
@@ -137,21 +145,22 @@ pub fn align_frames(
     alignments: &[PairAlignment],
     config: &FrameConsensusConfig,
 ) -> FrameOutcome {
-    let rigid = alignments.iter().map(|a| (a.i, a.j, a.t_i_j.pose, a.t_i_j.covariance));
+    let rigid = alignments.iter().map(|a| (a.i, a.j, (a.t_i_j.pose, a.t_i_j.covariance, true)));
     Measured::<6, Se3>::new(alpha, beta, rigid, config)
         .outcome()
         .map(|pose, covariance| PoseWithCovariance { pose, covariance })
 }
 
-/// Aligns two frames of which at least one has unknown scale: `t_alpha_beta` is a similarity, and every alignment
-/// measures scale itself. The same machinery with 7 degrees of freedom.
-pub fn align_frames_sim(
+/// Aligns two frames of which at least one has unknown scale: `t_alpha_beta` is a similarity. Alignments measure scale
+/// themselves, or leave it to the baselines between them; see [`SimMeasurement`]. The same machinery with 7 degrees of
+/// freedom.
+pub fn align_frames_sim<T: Copy + Into<SimMeasurement>>(
     alpha: &Trajectory,
     beta: &Trajectory,
-    alignments: &[PairAlignment<SimWithCovariance>],
+    alignments: &[PairAlignment<T>],
     config: &FrameConsensusConfig,
 ) -> FrameOutcome<SimWithCovariance> {
-    let similar = alignments.iter().map(|a| (a.i, a.j, a.t_i_j.sim, a.t_i_j.covariance));
+    let similar = alignments.iter().map(|a| (a.i, a.j, a.t_i_j.into().parts()));
     Measured::<7, Sim3>::new(alpha, beta, similar, config)
         .outcome()
         .map(|sim, covariance| SimWithCovariance { sim, covariance })
@@ -170,6 +179,7 @@ impl<G, const N: usize> FrameOutcome<(G, Covariance<N>)> {
             Self::Merged(c) => FrameOutcome::Merged(map(c)),
             Self::Provisional(c) => FrameOutcome::Provisional(map(c)),
             Self::Ambiguous { best, rival } => FrameOutcome::Ambiguous { best: map(best), rival: map(rival) },
+            Self::BaselineTooShort { log_scale_sigma } => FrameOutcome::BaselineTooShort { log_scale_sigma },
             Self::Inconsistent => FrameOutcome::Inconsistent,
         }
     }

@@ -6,7 +6,8 @@ use super::gate;
 use super::hypothesis::Hypothesis;
 use super::measured::Measured;
 use super::pairs::Pairs;
-use crate::geometry::{Covariance, Group};
+use super::scaled::Scaled;
+use crate::geometry::Covariance;
 
 /// Disjoint sets looked for at each covariance scale: the best and its rivals.
 const SETS_A_SCALE: usize = 3;
@@ -25,7 +26,7 @@ const STRAY_MARGIN_LOG10: f64 = 2.0;
 /// Too few or too weak to merge are shown below this: chance does as well in one case of ten.
 const SHOWN_LOG10_NFA_MAX: f64 = -1.0;
 
-impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
+impl<const N: usize, G: Scaled<N>> Measured<'_, N, G> {
     pub(super) fn outcome(&self) -> FrameOutcome<(G, Covariance<N>)> {
         let n = self.alignments.len();
         if n == 0 {
@@ -36,6 +37,9 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
         let Some(best) = best(&hypotheses) else { return FrameOutcome::Inconsistent };
         if let Some((first, second)) = self.rivals(&pairs, &hypotheses, best) {
             return FrameOutcome::Ambiguous { best: first.consensus(self), rival: second.consensus(self) };
+        }
+        if let Some(log_scale_sigma) = best.lacks_scale(self) {
+            return FrameOutcome::BaselineTooShort { log_scale_sigma };
         }
         let used = best.set.count_ones() as usize;
         // A single alignment has no frame-level evidence; it merges where the configuration trusts single ones.
@@ -143,7 +147,7 @@ impl<const N: usize, G: Group<N>> Measured<'_, N, G> {
 
 /// Of nested sets one: the larger if each member that it adds earns its place, else the smaller. What a clique leaves
 /// behind of a set at another gate is thus no explanation of its own, and no stray joins at a wide gate for nothing.
-fn unnested<const N: usize, G: Group<N>>(mut hypotheses: Vec<Hypothesis<N, G>>) -> Vec<Hypothesis<N, G>> {
+fn unnested<const N: usize, G: Scaled<N>>(mut hypotheses: Vec<Hypothesis<N, G>>) -> Vec<Hypothesis<N, G>> {
     let worth: Vec<(Set, f64)> = hypotheses.iter().map(|h| (h.set, h.log10_nfa)).collect();
     let within = |a: Set, b: Set| a != b && a & !b == 0;
     let earned = |set: Set, log10_nfa: f64| {
@@ -161,7 +165,7 @@ fn unnested<const N: usize, G: Group<N>>(mut hypotheses: Vec<Hypothesis<N, G>>) 
 /// The smallest NFA, but for two rules. At one gate the larger set is the better: how close together its members happen to
 /// lie says little. At a wide gate parts of a truth and of a lie may agree with each other, and a larger blend may beat
 /// the truth by little: so a set must beat those found at tighter gates by a margin.
-fn best<const N: usize, G: Group<N>>(hypotheses: &[Hypothesis<N, G>]) -> Option<&Hypothesis<N, G>> {
+fn best<const N: usize, G: Scaled<N>>(hypotheses: &[Hypothesis<N, G>]) -> Option<&Hypothesis<N, G>> {
     let better = |best: &Hypothesis<N, G>, h: &Hypothesis<N, G>| {
         let margin = if h.scale > best.scale { BLEND_MARGIN_LOG10 } else { 0.0 };
         h.log10_nfa < best.log10_nfa - margin

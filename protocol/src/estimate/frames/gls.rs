@@ -4,8 +4,8 @@
 
 use super::clique::{self, Set};
 use super::measured::{Alignment, Measured};
+use super::scaled::Scaled;
 use crate::estimate::residual::Residual;
-use crate::geometry::Group;
 use nalgebra::{DMatrix, Dyn, SMatrix, SVector, linalg::Cholesky};
 
 /// Gauss–Newton steps at most; from a member's own hypothesis three or four suffice.
@@ -18,30 +18,31 @@ pub(super) struct Gls<const N: usize, G> {
     pub(super) t_alpha_beta: G,
     /// Covariance of its local perturbation, before any scale.
     pub(super) covariance: SMatrix<f64, N, N>,
-    /// χ² of the residuals, with N (members − 1) degrees of freedom.
+    /// χ² of the residuals.
     pub(super) chi_squared: f64,
+    /// Its degrees of freedom: all values measured less those of T_αβ.
+    pub(super) freedom: usize,
     /// Squared Mahalanobis distance of each member, in the set's order, from its best prediction by all others (trajectory
-    /// correlations included): χ² with N degrees of freedom. Empty for a single member.
+    /// correlations included): χ² with as many degrees of freedom as the member measures. Empty for a single member.
     pub(super) left_out: Vec<f64>,
 }
 
-impl<const N: usize, G: Group<N>> Gls<N, G> {
-    /// χ² without a member that lies `distance_squared` from what the others predict, and its degrees of freedom.
-    pub(super) fn others(&self, distance_squared: f64) -> (f64, f64) {
-        let freedom = N * self.left_out.len().saturating_sub(2);
-        ((self.chi_squared - distance_squared).max(0.0), freedom as f64)
+impl<const N: usize, G: Scaled<N>> Gls<N, G> {
+    /// χ² without a member of `dimension` values that lies `distance_squared` from what the others predict, and its degrees
+    /// of freedom.
+    pub(super) fn others(&self, distance_squared: f64, dimension: usize) -> (f64, f64) {
+        ((self.chi_squared - distance_squared).max(0.0), self.freedom.saturating_sub(dimension) as f64)
     }
 
-    /// Solves over `set`, starting from member `hub`'s hypothesis. `None` where the covariance is numerically singular
+    /// Solves over `set`, starting from `t_alpha_beta`. `None` where the covariance is numerically singular
     /// or the iteration runs away.
-    pub(super) fn solve(measured: &Measured<'_, N, G>, set: Set, hub: usize) -> Option<Self> {
+    pub(super) fn solve(measured: &Measured<'_, N, G>, set: Set, mut t_alpha_beta: G) -> Option<Self> {
         let members: Vec<&Alignment<N, G>> = clique::vertices(set).map(|l| &measured.alignments[l]).collect();
-        let mut t_alpha_beta = measured.hypothesis(&measured.alignments[hub])?;
         let mut system = System::new(measured, &members, &t_alpha_beta)?;
         for _ in 0..ITERATIONS_MAX {
             let step = system.covariance * system.gradient;
             t_alpha_beta = t_alpha_beta.retract(&-step);
-            if !step.iter().all(|x| x.is_finite()) {
+            if !step.iter().all(|x| x.is_finite()) || !(1e-6..1e6).contains(&t_alpha_beta.scale()) {
                 return None;
             }
             system = System::new(measured, &members, &t_alpha_beta)?;
@@ -55,6 +56,7 @@ impl<const N: usize, G: Group<N>> Gls<N, G> {
             t_alpha_beta,
             covariance: system.covariance,
             chi_squared: system.h.column(0).norm_squared() - explained,
+            freedom: members.iter().map(|m| m.dimension()).sum::<usize>().saturating_sub(N),
             left_out,
         })
     }
@@ -74,27 +76,33 @@ struct System<const N: usize> {
 }
 
 impl<const N: usize> System<N> {
-    fn new<G: Group<N>>(measured: &Measured<'_, N, G>, members: &[&Alignment<N, G>], t_alpha_beta: &G) -> Option<Self> {
-        let residuals: Vec<Residual<N>> = members
+    fn new<G: Scaled<N>>(
+        measured: &Measured<'_, N, G>,
+        members: &[&Alignment<N, G>],
+        t_alpha_beta: &G,
+    ) -> Option<Self> {
+        let residuals: Vec<(Residual<N>, SMatrix<f64, N, N>)> = members
             .iter()
             .map(|m| {
                 let (t_alpha_i, t_beta_j) = (measured.alpha.pose(m.i)?, measured.beta.pose(m.j)?);
-                Some(Residual::new(&G::embed(&t_alpha_i), &m.t_i_j, t_alpha_beta, &G::embed(&t_beta_j)))
+                let (t_i_j, sigma) = m.at(t_alpha_beta.scale());
+                let r = Residual::new(&G::embed(&t_alpha_i), &t_i_j, t_alpha_beta, &G::embed(&t_beta_j));
+                Some((r, sigma))
             })
             .collect::<Option<_>>()?;
         let rows = N * members.len();
         let mut c = DMatrix::<f64>::zeros(rows, rows);
         let (mut j, mut h) = (DMatrix::zeros(rows, N), DMatrix::zeros(rows, 1));
-        for (b, (rb, mb)) in residuals.iter().zip(members).enumerate() {
+        for (b, ((rb, _), mb)) in residuals.iter().zip(members).enumerate() {
             j.fixed_view_mut::<N, N>(N * b, 0).copy_from(&rb.j_alpha_beta);
             h.fixed_view_mut::<N, 1>(N * b, 0).copy_from(&rb.h);
             // The factorisation reads the lower triangle only.
-            for (a, (ra, ma)) in residuals.iter().zip(members).enumerate().skip(b) {
+            for (a, ((ra, sigma), ma)) in residuals.iter().zip(members).enumerate().skip(b) {
                 let of_alpha = G::embed_covariance(&measured.alpha.cross_covariance(ma.i, mb.i)?);
                 let of_beta = G::embed_covariance(&measured.beta.cross_covariance(ma.j, mb.j)?);
                 let mut block = ra.j_i * of_alpha * rb.j_i.transpose() + ra.j_j * of_beta * rb.j_j.transpose();
                 if a == b {
-                    block += ra.j_ij * ma.covariance.matrix() * ra.j_ij.transpose();
+                    block += ra.j_ij * sigma * ra.j_ij.transpose();
                 }
                 c.fixed_view_mut::<N, N>(N * a, N * b).copy_from(&block);
             }

@@ -6,7 +6,8 @@ use super::gls::Gls;
 use super::measured::Measured;
 use super::pairs::Pairs;
 use super::predict::surprise;
-use crate::geometry::{Covariance, Group};
+use super::scaled::{LOG_SCALE_SIGMA_MAX, Scaled, log_scale_sigma};
+use crate::geometry::Covariance;
 
 /// A member this improbable, given what the others predict, is none.
 const SURPRISE_MIN: f64 = 1e-3;
@@ -21,7 +22,7 @@ pub(super) struct Hypothesis<const N: usize, G> {
     gls: Gls<N, G>,
 }
 
-impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
+impl<const N: usize, G: Scaled<N>> Hypothesis<N, G> {
     /// Estimates over `set`; drops, worst first, members that the others do not predict.
     pub(super) fn settle(
         measured: &Measured<'_, N, G>,
@@ -32,7 +33,8 @@ impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
     ) -> Option<Self> {
         loop {
             let (log10_nfa, hub) = pairs.log10_nfa::<N>(set, measured.search_volume());
-            let gls = Gls::solve(measured, set, hub)?;
+            let start = measured.hypothesis(&measured.alignments[hub], pairs.scale(hub, set))?;
+            let gls = Gls::solve(measured, set, start)?;
             match unpredicted(measured, set, &gls) {
                 0 => return Some(Self { set, scale, log10_nfa, largest, gls }),
                 some => set &= !some,
@@ -45,10 +47,17 @@ impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
         self.gls.left_out.get((self.set & (bit(l) - 1)).count_ones() as usize).copied().unwrap_or(0.0)
     }
 
+    /// Standard deviation of log-scale, where no member measures scale and their baselines are too short for it.
+    pub(super) fn lacks_scale(&self, measured: &Measured<'_, N, G>) -> Option<f64> {
+        let unmeasured = clique::vertices(self.set).all(|l| !measured.alignments[l].measures_scale);
+        let sigma = log_scale_sigma(&self.gls.covariance);
+        (unmeasured && sigma > LOG_SCALE_SIGMA_MAX).then_some(sigma)
+    }
+
     /// As an answer to the caller.
     pub(super) fn consensus(&self, measured: &Measured<'_, N, G>) -> FrameConsensus<(G, Covariance<N>)> {
         let scale_max = measured.config.covariance_scale_max.max(1.0);
-        let freedom = N as f64 * f64::from(self.set.count_ones() - 1).max(1.0);
+        let freedom = self.gls.freedom.max(1) as f64;
         // A χ² that chance exceeds once in fifty times says nothing against the stated covariances.
         let excess = self.gls.chi_squared / freedom;
         let significant = excess > 1.0 + 2.33 * (2.0 / freedom).sqrt();
@@ -66,13 +75,16 @@ impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
 
 /// The worst of the members that the others do not predict: a sixteenth of the set, but at least one, at a time, since
 /// one bad member spoils the prediction of others. Two members always stay.
-fn unpredicted<const N: usize, G: Group<N>>(measured: &Measured<'_, N, G>, set: Set, gls: &Gls<N, G>) -> Set {
+fn unpredicted<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, set: Set, gls: &Gls<N, G>) -> Set {
     let scales = measured.scales();
     let mut outside: Vec<(f64, usize)> = gls
         .left_out
         .iter()
         .zip(clique::vertices(set))
-        .map(|(&d2, l)| (surprise::<N>(d2, gls.others(d2), &scales), l))
+        .map(|(&d2, l)| {
+            let dimension = measured.alignments[l].dimension();
+            (surprise(dimension, d2, gls.others(d2, dimension), &scales), l)
+        })
         .filter(|&(p, _)| p < SURPRISE_MIN)
         .collect();
     outside.sort_by(|a, b| a.0.total_cmp(&b.0));

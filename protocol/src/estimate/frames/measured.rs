@@ -1,16 +1,15 @@
 //! All that was measured between two frames, in an order that does not depend on the caller's: the same set of
 //! alignments gives the same answer to the bit.
 
+use super::scaled::{LOG_SCALE_RANGE, Scaled};
 use super::{ALIGNMENTS_MAX, FrameConsensusConfig, Rotations};
 use crate::estimate::trajectory::Trajectory;
-use crate::geometry::{Covariance, Group};
+use crate::geometry::Covariance;
 use core::f64::consts::PI;
 use libm::pow;
 
 /// Covariance scales tried, log-spaced from 1 to the configured largest.
 pub(super) const SCALES: usize = 5;
-/// ln 400: the range of scales, 0.05 to 20, over which a false similarity may fall.
-const LOG_SCALE_RANGE: f64 = 5.991_464_547_107_982;
 
 /// An alignment in either group, and where the caller had it.
 pub(super) struct Alignment<const N: usize, G> {
@@ -18,6 +17,8 @@ pub(super) struct Alignment<const N: usize, G> {
     pub(super) j: usize,
     pub(super) t_i_j: G,
     pub(super) covariance: Covariance<N>,
+    /// Or `t_i_j` is at scale 1, to be taken [`Alignment::at`] another.
+    pub(super) measures_scale: bool,
     pub(super) position: usize,
 }
 
@@ -29,20 +30,20 @@ pub(super) struct Measured<'a, const N: usize, G> {
     pub(super) config: &'a FrameConsensusConfig,
 }
 
-impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
+impl<'a, const N: usize, G: Scaled<N>> Measured<'a, N, G> {
     /// Sorts, drops exact duplicates and alignments past either trajectory's end, and thins to [`ALIGNMENTS_MAX`].
     pub(super) fn new(
         alpha: &'a Trajectory,
         beta: &'a Trajectory,
-        alignments: impl Iterator<Item = (usize, usize, G, Covariance<N>)>,
+        alignments: impl Iterator<Item = (usize, usize, (G, Covariance<N>, bool))>,
         config: &'a FrameConsensusConfig,
     ) -> Self {
         let mut keyed: Vec<(Vec<f64>, Alignment<N, G>)> = alignments
             .enumerate()
             .filter(|(_, (i, j, ..))| *i < alpha.len() && *j < beta.len())
-            .map(|(position, (i, j, t_i_j, covariance))| {
+            .map(|(position, (i, j, (t_i_j, covariance, measures_scale)))| {
                 let key = t_i_j.log().iter().chain(covariance.matrix().iter()).copied().collect();
-                (key, Alignment { i, j, t_i_j, covariance, position })
+                (key, Alignment { i, j, t_i_j, covariance, measures_scale, position })
             })
             .collect();
         let order = |(a_key, a): &(Vec<f64>, Alignment<N, G>), (b_key, b): &(Vec<f64>, Alignment<N, G>)| {
@@ -78,9 +79,9 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         translations * rotations * scales
     }
 
-    /// T_αβ as alignment `a` alone gives it.
-    pub(super) fn hypothesis(&self, a: &Alignment<N, G>) -> Option<G> {
+    /// T_αβ as alignment `a` gives it, at `scale` where it does not measure one.
+    pub(super) fn hypothesis(&self, a: &Alignment<N, G>, scale: f64) -> Option<G> {
         let (t_alpha_i, t_beta_j) = (self.alpha.pose(a.i)?, self.beta.pose(a.j)?);
-        Some(G::embed(&t_alpha_i) * a.t_i_j * G::embed(&t_beta_j).inverse())
+        Some(G::embed(&t_alpha_i) * a.at(scale).0 * G::embed(&t_beta_j).inverse())
     }
 }

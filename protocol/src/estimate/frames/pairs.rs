@@ -6,9 +6,10 @@
 
 use super::clique::{self, Set, bit};
 use super::measured::{Alignment, Measured};
+use super::scaled::{Scale, Scaled};
 use crate::estimate::residual::Residual;
 use crate::estimate::trajectory::Trajectory;
-use crate::geometry::{Group, Se3};
+use crate::geometry::Se3;
 use core::f64::consts::PI;
 use libm::{lgamma, log};
 use nalgebra::{Matrix6, SMatrix};
@@ -20,13 +21,20 @@ pub(super) struct Pairs {
     distance_squared: Vec<f64>,
     /// ln √det of each residual's covariance.
     log_sqrt_det: Vec<f64>,
+    /// The scale of the frames under which each residual was taken.
+    scales: Vec<Scale>,
 }
 
 impl Pairs {
-    pub(super) fn new<const N: usize, G: Group<N>>(measured: &Measured<'_, N, G>) -> Self {
+    pub(super) fn new<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>) -> Self {
         let alignments = &measured.alignments;
         let n = alignments.len();
-        let mut pairs = Self { n, distance_squared: vec![0.0; n * n], log_sqrt_det: vec![0.0; n * n] };
+        let mut pairs = Self {
+            n,
+            distance_squared: vec![0.0; n * n],
+            log_sqrt_det: vec![0.0; n * n],
+            scales: vec![Scale { value: 1.0, log_sigma: f64::INFINITY }; n * n],
+        };
         let (alpha, beta) = (
             Odometry::new(measured.alpha, alignments.iter().map(|a| a.i)),
             Odometry::new(measured.beta, alignments.iter().map(|a| a.j)),
@@ -34,12 +42,21 @@ impl Pairs {
         for (m, hypothesis) in alignments.iter().enumerate() {
             let (from_i, from_j) = (alpha.relatives(m), beta.relatives(m));
             for (l, tested) in alignments.iter().enumerate().filter(|&(l, _)| l != m) {
-                let (d2, log_sqrt_det) = distance(hypothesis, tested, &from_i[alpha.slot[l]], &from_j[beta.slot[l]]);
+                let (a, b) = (&from_i[alpha.slot[l]], &from_j[beta.slot[l]]);
+                let scale = Scale::of_pair(hypothesis, tested, a, b);
+                let (d2, log_sqrt_det) = distance(hypothesis, tested, a, b, scale.value);
+                pairs.scales[m * n + l] = scale;
                 pairs.distance_squared[m * n + l] = d2;
                 pairs.log_sqrt_det[m * n + l] = log_sqrt_det;
             }
         }
         pairs
+    }
+
+    /// The scale of the frames as `member` has it together with that other of `set` with which it has it best.
+    pub(super) fn scale(&self, member: usize, set: Set) -> f64 {
+        let others = clique::vertices(set & !bit(member)).map(|l| self.scales[member * self.n + l]);
+        others.min_by(|a, b| a.log_sigma.total_cmp(&b.log_sigma)).map_or(1.0, |s| s.value)
     }
 
     /// Whether m and l agree at the gate, each under the other.
@@ -85,16 +102,18 @@ impl Pairs {
 }
 
 /// d² of `tested` under `hypothesis`, and ln √det of the residual's covariance.
-fn distance<const N: usize, G: Group<N>>(
+fn distance<const N: usize, G: Scaled<N>>(
     hypothesis: &Alignment<N, G>,
     tested: &Alignment<N, G>,
     (a, sigma_a): &(Se3, Matrix6<f64>),
     (b, sigma_b): &(Se3, Matrix6<f64>),
+    scale: f64,
 ) -> (f64, f64) {
-    let r = Residual::new(&G::embed(a), &tested.t_i_j, &hypothesis.t_i_j, &G::embed(b));
+    let ((tested, of_tested), (hypothesis, of_hypothesis)) = (tested.at(scale), hypothesis.at(scale));
+    let r = Residual::new(&G::embed(a), &tested, &hypothesis, &G::embed(b));
     let sigma: SMatrix<f64, N, N> =
-        r.covariance(&G::embed_covariance(sigma_a), &G::embed_covariance(sigma_b), tested.covariance.matrix())
-            + r.j_alpha_beta * hypothesis.covariance.matrix() * r.j_alpha_beta.transpose();
+        r.covariance(&G::embed_covariance(sigma_a), &G::embed_covariance(sigma_b), &of_tested)
+            + r.j_alpha_beta * of_hypothesis * r.j_alpha_beta.transpose();
     let Some(c) = sigma.cholesky() else { return (f64::INFINITY, 0.0) };
     let log_sqrt_det = c.l_dirty().diagonal().iter().map(|&x| log(x)).sum();
     let d2 = c.solve(&r.h).dot(&r.h);
