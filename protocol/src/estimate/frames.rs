@@ -4,15 +4,19 @@
 //! Every alignment is one hypothesis; nothing is sampled. Pair distances under relative trajectory covariances give a
 //! graph of agreement at each of 5 covariance scales in [1, 3]. The largest cliques of each are settled: joint least
 //! squares with cross-covariances, and a leave-one-out χ² test, marginalised over the scale, that drops what the others
-//! do not predict. What is settled is compared by number of false alarms (NFA), the tighter first: a set must gain by each
-//! member that it adds, and a union of two sets that contradict each other must beat the two apart. Frames merge at
-//! NFA < 1e-4 and 3 alignments, unless a rival that contradicts the best has about as many members. Same set of
-//! alignments, same answer to the bit, in any order.
+//! do not predict. The settled sets are candidates of an explanation: one set that speaks of one transform, or two that
+//! speak of two, by σ-marginalised evidence of their stacked residuals. Frames merge at a number of false alarms (NFA)
+//! < 1e-4 and 3 alignments, unless a second set has about as many members as the first. Same set of alignments, same
+//! answer to the bit, in any order.
 //!
-//! *Measured*, see `merganser-sim bench frames`.
+//! *Measured* by `merganser-sim bench frames` over thousands of worlds: 4 true alignments against 3 of one lie merge
+//! rightly in 99.2 to 99.8 %, 4 against 4 are ambiguous in 99.9 to 100 %. The NFA alone, without evidence, reaches 97 and
+//! merges 0.3 % of the former wrongly; the prototype of MATH §5, over 400 worlds, 97.8 and 2.3 %.
 
 mod clique;
 mod decide;
+mod evidence;
+mod explain;
 mod gls;
 mod hypothesis;
 mod measured;

@@ -4,7 +4,7 @@ use merganser_protocol::estimate::frames::world::{Draw, SimWorld, World};
 use merganser_protocol::estimate::frames::{
     FrameConsensusConfig, FrameOutcome, SimMeasurement, align_frames, align_frames_sim,
 };
-use merganser_protocol::geometry::{Covariance, Se3};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, SimWithCovariance};
 use nalgebra::SVector;
 use std::fmt::Write;
 use std::ops::Range;
@@ -121,7 +121,8 @@ pub fn measure(cell: &Cell, seeds: Range<u64>, mut done: impl FnMut()) -> Tally 
         match cell.unit {
             Unit::Metre => {
                 let outcome = align_frames(&world.alpha, &world.beta, &world.alignments, &config);
-                tally.add(&world, outcome, |t| &t.covariance, |t| (t.pose, t.pose.local(&world.t_alpha_beta)));
+                let judge = |t: &PoseWithCovariance| (world.is_right(&t.pose), t.pose.local(&world.t_alpha_beta));
+                tally.add(&world, outcome, |t| &t.covariance, judge);
             }
             Unit::Measured => tally.add_sim(&world, &world.with_unknown_scale(seed), &config),
             Unit::Unmeasured => tally.add_sim(&world, &world.with_unmeasured_scale(seed), &config),
@@ -139,7 +140,8 @@ impl Tally {
         config: &FrameConsensusConfig,
     ) {
         let outcome = align_frames_sim(&sim.alpha, &sim.beta, &sim.alignments, config);
-        self.add(world, outcome, |t| &t.covariance, |t| (t.sim.to_se3(), t.sim.local(&sim.t_alpha_beta)));
+        let judge = |t: &SimWithCovariance| (sim.is_right(&t.sim), t.sim.local(&sim.t_alpha_beta));
+        self.add(world, outcome, |t| &t.covariance, judge);
     }
 
     fn add<const N: usize, T>(
@@ -147,15 +149,15 @@ impl Tally {
         world: &World,
         outcome: FrameOutcome<T>,
         covariance: impl Fn(&T) -> &Covariance<N>,
-        error: impl Fn(&T) -> (Se3, SVector<f64, N>),
+        judge: impl Fn(&T) -> (bool, SVector<f64, N>),
     ) {
         self.worlds += 1;
         match outcome {
             FrameOutcome::Merged(c) => {
-                let (pose, error) = error(&c.t_alpha_beta);
+                let (right, error) = judge(&c.t_alpha_beta);
                 let distance_squared = covariance(&c.t_alpha_beta).mahalanobis_squared(&error);
                 let with_false = c.used.iter().any(|&k| !world.real[k]);
-                *match (world.is_right(&pose), with_false) {
+                *match (right, with_false) {
                     (true, _) => &mut self.merged_right,
                     (false, false) => &mut self.merged_weak,
                     (false, true) => &mut self.merged_wrong,
@@ -165,7 +167,7 @@ impl Tally {
                 self.inside += u32::from(distance_squared < CHI2_95[N - 6]);
             }
             FrameOutcome::Provisional(c) => {
-                let right = world.is_right(&error(&c.t_alpha_beta).0);
+                let (right, _) = judge(&c.t_alpha_beta);
                 *(if right { &mut self.shown_right } else { &mut self.shown_wrong }) += 1;
             }
             FrameOutcome::Ambiguous { .. } => self.ambiguous += 1,

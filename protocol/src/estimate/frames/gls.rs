@@ -6,6 +6,7 @@ use super::clique::{self, Set};
 use super::measured::{Alignment, Measured};
 use super::scaled::Scaled;
 use crate::estimate::residual::Residual;
+use libm::log;
 use nalgebra::{DMatrix, Dyn, SMatrix, SVector, linalg::Cholesky};
 
 /// Gauss–Newton steps at most; from a member's own hypothesis three or four suffice.
@@ -22,9 +23,19 @@ pub(super) struct Gls<const N: usize, G> {
     pub(super) chi_squared: f64,
     /// Its degrees of freedom: all values measured less those of T_αβ.
     pub(super) freedom: usize,
-    /// Squared Mahalanobis distance of each member, in the set's order, from its best prediction by all others (trajectory
-    /// correlations included): χ² with as many degrees of freedom as the member measures. Empty for a single member.
-    pub(super) left_out: Vec<f64>,
+    /// ln √(|C| |Jᵀ C⁻¹ J|), of the residuals' covariance C: what the residuals' density and the freedom to choose T_αβ cost.
+    pub(super) log_sqrt_det: f64,
+    /// Each member as the others predict it, in the set's order. Empty for a single member.
+    pub(super) left_out: Vec<LeftOut>,
+}
+
+/// A member of a set as all the others predict it, trajectory correlations included.
+#[derive(Clone, Copy)]
+pub(super) struct LeftOut {
+    /// Squared Mahalanobis distance from the prediction: χ² with as many degrees of freedom as the member measures.
+    pub(super) distance_squared: f64,
+    /// ln √det of the prediction's covariance, the member's own included.
+    pub(super) log_sqrt_det: f64,
 }
 
 impl<const N: usize, G: Scaled<N>> Gls<N, G> {
@@ -57,6 +68,7 @@ impl<const N: usize, G: Scaled<N>> Gls<N, G> {
             covariance: system.covariance,
             chi_squared: system.h.column(0).norm_squared() - explained,
             freedom: members.iter().map(|m| m.dimension()).sum::<usize>().saturating_sub(N),
+            log_sqrt_det: system.log_sqrt_det(),
             left_out,
         })
     }
@@ -117,13 +129,20 @@ impl<const N: usize> System<N> {
         Some(Self { factor, j, h, gradient, covariance })
     }
 
+    /// ln √(|C| |Jᵀ C⁻¹ J|).
+    fn log_sqrt_det(&self) -> f64 {
+        let of_c: f64 = self.factor.l_dirty().diagonal().iter().map(|&x| log(x)).sum();
+        let of_covariance = self.covariance.cholesky().map(|f| f.l_dirty().diagonal().iter().map(|&x| log(x)).sum());
+        of_c - of_covariance.unwrap_or(f64::NEG_INFINITY)
+    }
+
     /// With the projected information P = C⁻¹ − C⁻¹J (JᵀC⁻¹J)⁻¹ JᵀC⁻¹, member l's prediction by the others is off by
     /// P_ll⁻¹ (P h)_l with covariance P_ll⁻¹, so d² = (P h)_lᵀ P_ll⁻¹ (P h)_l: one factorisation serves all.
-    fn left_out(&self, members: usize) -> Vec<f64> {
+    fn left_out(&self, members: usize) -> Vec<LeftOut> {
         let rows = N * members;
         let mut l_inv = DMatrix::<f64>::identity(rows, rows);
         if !self.factor.l_dirty().solve_lower_triangular_mut(&mut l_inv) {
-            return vec![f64::INFINITY; members];
+            return vec![LeftOut { distance_squared: f64::INFINITY, log_sqrt_det: f64::INFINITY }; members];
         }
         // L⁻¹ (h − J x̂)
         let fit = self.covariance * self.gradient;
@@ -138,7 +157,12 @@ impl<const N: usize> System<N> {
                 let c_inv = SMatrix::<f64, N, N>::from_fn(|r, c| column(r).dot(&column(c)));
                 let p = c_inv - of_j * self.covariance * of_j.transpose();
                 let p_h = SVector::<f64, N>::from_fn(|r, _| column(r).dot(&unexplained));
-                p.cholesky().map_or(f64::INFINITY, |f| f.solve(&p_h).dot(&p_h))
+                p.cholesky().map_or(LeftOut { distance_squared: f64::INFINITY, log_sqrt_det: f64::INFINITY }, |f| {
+                    LeftOut {
+                        distance_squared: f.solve(&p_h).dot(&p_h),
+                        log_sqrt_det: -f.l_dirty().diagonal().iter().map(|&x| log(x)).sum::<f64>(),
+                    }
+                })
             })
             .collect()
     }

@@ -14,37 +14,21 @@ const SURPRISE_MIN: f64 = 1e-3;
 /// A settled set of alignments.
 pub(super) struct Hypothesis<const N: usize, G> {
     pub(super) set: Set,
-    /// Covariance scale of the gate that found it.
-    pub(super) scale: f64,
     pub(super) log10_nfa: f64,
-    /// Of the sets found at that gate, whether it was the largest.
-    pub(super) largest: bool,
     gls: Gls<N, G>,
 }
 
 impl<const N: usize, G: Scaled<N>> Hypothesis<N, G> {
     /// Estimates over `set`; drops, worst first, members that the others do not predict.
-    pub(super) fn settle(
-        measured: &Measured<'_, N, G>,
-        pairs: &Pairs,
-        mut set: Set,
-        scale: f64,
-        largest: bool,
-    ) -> Option<Self> {
+    pub(super) fn settle(measured: &Measured<'_, N, G>, pairs: &Pairs, mut set: Set) -> Option<Self> {
         loop {
-            let (log10_nfa, hub) = pairs.log10_nfa::<N>(set, measured.search_volume());
-            let start = measured.hypothesis(&measured.alignments[hub], pairs.scale(hub, set))?;
-            let gls = Gls::solve(measured, set, start)?;
+            let (log10_nfa, hub) = pairs.log10_nfa(measured, set);
+            let gls = Gls::solve(measured, set, start(measured, pairs, set, hub)?)?;
             match unpredicted(measured, set, &gls) {
-                0 => return Some(Self { set, scale, log10_nfa, largest, gls }),
+                0 => return Some(Self { set, log10_nfa, gls }),
                 some => set &= !some,
             }
         }
-    }
-
-    /// Squared distance of member `l` from what the others predict.
-    pub(super) fn left_out(&self, l: usize) -> f64 {
-        self.gls.left_out.get((self.set & (bit(l) - 1)).count_ones() as usize).copied().unwrap_or(0.0)
     }
 
     /// Standard deviation of log-scale, where no member measures scale and their baselines are too short for it.
@@ -73,6 +57,16 @@ impl<const N: usize, G: Scaled<N>> Hypothesis<N, G> {
     }
 }
 
+/// T_αβ as member `hub` of `set` has it.
+pub(super) fn start<const N: usize, G: Scaled<N>>(
+    measured: &Measured<'_, N, G>,
+    pairs: &Pairs,
+    set: Set,
+    hub: usize,
+) -> Option<G> {
+    measured.hypothesis(&measured.alignments[hub], pairs.scale(hub, set))
+}
+
 /// The worst of the members that the others do not predict: a sixteenth of the set, but at least one, at a time, since
 /// one bad member spoils the prediction of others. Two members always stay.
 fn unpredicted<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, set: Set, gls: &Gls<N, G>) -> Set {
@@ -81,7 +75,8 @@ fn unpredicted<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, set:
         .left_out
         .iter()
         .zip(clique::vertices(set))
-        .map(|(&d2, l)| {
+        .map(|(left_out, l)| {
+            let d2 = left_out.distance_squared;
             let dimension = measured.alignments[l].dimension();
             (surprise(dimension, d2, gls.others(d2, dimension), &scales), l)
         })

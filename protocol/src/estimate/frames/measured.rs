@@ -28,6 +28,14 @@ pub(super) struct Measured<'a, const N: usize, G> {
     pub(super) beta: &'a Trajectory,
     pub(super) alignments: Vec<Alignment<N, G>>,
     pub(super) config: &'a FrameConsensusConfig,
+    /// Volumes of the boxes around either trajectory, each in its own unit.
+    boxes: [f64; 2],
+}
+
+/// Log-spaced from 1 to `largest`.
+pub(super) fn scales_to(largest: f64) -> [f64; SCALES] {
+    let step = 1.0 / (SCALES - 1) as f64;
+    core::array::from_fn(|k| pow(largest, k as f64 * step))
 }
 
 impl<'a, const N: usize, G: Scaled<N>> Measured<'a, N, G> {
@@ -57,26 +65,27 @@ impl<'a, const N: usize, G: Scaled<N>> Measured<'a, N, G> {
         let kept = n.min(ALIGNMENTS_MAX);
         let mut taken = (0..kept).map(|k| k * n / kept).peekable();
         let thinned = keyed.into_iter().enumerate().filter(|(k, _)| taken.next_if_eq(k).is_some());
-        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config }
+        let volume = |t: &Trajectory| t.extent().map(|edge| edge.max(config.search_edge_min)).product();
+        let boxes = [volume(alpha), volume(beta)];
+        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config, boxes }
     }
 
     /// The covariance scales tried, ascending from 1.
     pub(super) fn scales(&self) -> [f64; SCALES] {
-        let step = 1.0 / (SCALES - 1) as f64;
-        core::array::from_fn(|k| pow(self.config.covariance_scale_max.max(1.0), k as f64 * step))
+        scales_to(self.config.covariance_scale_max.max(1.0))
     }
 
-    /// Volume into which chance would spread residuals: the box around the smaller trajectory (β's for similarities,
-    /// whose residuals are in β's units), times rotations, times the range of log-scale.
-    pub(super) fn search_volume(&self) -> f64 {
-        let of = |t: &Trajectory| t.extent().map(|edge| edge.max(self.config.search_edge_min)).product();
-        let (alpha, beta): (f64, f64) = (of(self.alpha), of(self.beta));
-        let (translations, scales) = if N == 7 { (beta, LOG_SCALE_RANGE) } else { (alpha.min(beta), 1.0) };
+    /// Volume into which chance would spread residuals where the frames' scale is `scale`: the box around the smaller
+    /// trajectory in β's unit, that of residuals, times rotations, times the range of log-scale. A scale that shrinks α
+    /// shrinks its box with the residuals, so that shrinking never wins.
+    pub(super) fn search_volume(&self, scale: f64) -> f64 {
+        let [alpha, beta] = self.boxes;
         let rotations = match self.config.rotations {
             Rotations::Heading => 2.0 * PI * 0.4 * 0.4,
             Rotations::All => 8.0 * PI * PI,
         };
-        translations * rotations * scales
+        let scales = if N == 7 { LOG_SCALE_RANGE } else { 1.0 };
+        (alpha / (scale * scale * scale)).min(beta) * rotations * scales
     }
 
     /// T_αβ as alignment `a` gives it, at `scale` where it does not measure one.

@@ -64,13 +64,6 @@ impl Pairs {
         self.distance_squared[m * self.n + l] < gate && self.distance_squared[l * self.n + m] < gate
     }
 
-    /// Whether two disjoint sets deny each other: fewer than half of the pairs across agree at the gate. Two halves of one
-    /// truth, parted by a pair just outside the gate, do not.
-    pub(super) fn contradict(&self, a: Set, b: Set, gate: f64) -> bool {
-        let across = || clique::vertices(a).flat_map(|m| clique::vertices(b).map(move |l| (m, l)));
-        2 * across().filter(|&(m, l)| self.agree(m, l, gate)).count() < across().count()
-    }
-
     /// Neighbours of each alignment in the graph of agreement at a gate on d².
     pub(super) fn graph(&self, gate: f64) -> Vec<Set> {
         let neighbours = |m: usize| (0..self.n).filter(|&l| l != m && self.agree(m, l, gate)).map(bit).sum();
@@ -79,11 +72,15 @@ impl Pairs {
 
     /// Log₁₀ of the number of false alarms of `set`, and the member it is counted from.
     ///
-    /// Under chance a residual falls evenly into `volume`; it comes as near to a hypothesis as the set's worst member does
+    /// Under chance a residual falls evenly into the search volume; it comes as near to a hypothesis as the set's worst member does
     /// with the probability α of that ellipsoid. NFA = n (n − 1) C(n − 1, k) Π α over the k other members (n hypotheses,
     /// n − 1 radii); the smallest over members as hypotheses. No set counts as nearer than true alignments are on average,
     /// d² = N, so that one alignment told many times proves little.
-    pub(super) fn log10_nfa<const N: usize>(&self, set: Set, volume: f64) -> (f64, usize) {
+    pub(super) fn log10_nfa<const N: usize, G: Scaled<N>>(
+        &self,
+        measured: &Measured<'_, N, G>,
+        set: Set,
+    ) -> (f64, usize) {
         let k = f64::from(set.count_ones().saturating_sub(1));
         let n = self.n as f64;
         let choices = log(n * (n - 1.0).max(1.0)) + lgamma(n) - lgamma(k + 1.0) - lgamma(n - k);
@@ -91,8 +88,12 @@ impl Pairs {
         for hub in clique::vertices(set) {
             let others = || clique::vertices(set & !bit(hub)).map(|l| hub * self.n + l);
             let radius_squared = others().map(|at| self.distance_squared[at]).fold(N as f64, f64::max);
-            let ball = log_ball_volume(N) + 0.5 * N as f64 * log(radius_squared) - log(volume);
-            let chance: f64 = others().map(|at| (ball + self.log_sqrt_det[at]).min(0.0)).sum();
+            let ball = log_ball_volume(N) + 0.5 * N as f64 * log(radius_squared);
+            let chance_of = |at: usize| {
+                let volume = measured.search_volume(self.scales[at].value);
+                (ball + self.log_sqrt_det[at] - log(volume)).min(0.0)
+            };
+            let chance: f64 = others().map(chance_of).sum();
             if chance < best.0 {
                 best = (chance, hub);
             }

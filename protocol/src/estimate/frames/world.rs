@@ -15,6 +15,9 @@ use rand_chacha::ChaCha8Rng;
 const ANCHORS: usize = 150;
 const ODOMETRY_SIGMAS: [f64; 2] = [0.02, 0.003];
 const ALIGNMENT_SIGMAS: [f64; 2] = [0.05, 0.01];
+/// Errors below which an estimate is right, 8° and 3 m.
+const RIGHT_RAD: f64 = 8.0 * PI / 180.0;
+const RIGHT_M: f64 = 3.0;
 
 /// What is drawn.
 #[derive(Clone, Copy, Debug)]
@@ -95,7 +98,7 @@ impl World {
     pub fn is_right(&self, t_alpha_beta: &Se3) -> bool {
         let error = self.t_alpha_beta.inverse() * *t_alpha_beta;
         let shift = (error * self.beta_centre - self.beta_centre).norm();
-        error.rotation.angle() < 8.0_f64.to_radians() && shift < 3.0
+        error.rotation.angle() < RIGHT_RAD && shift < RIGHT_M
     }
 
     /// Normalised estimation error squared.
@@ -115,6 +118,16 @@ pub struct SimWorld<T> {
     pub alignments: Vec<PairAlignment<T>>,
     /// The truth.
     pub t_alpha_beta: Sim3,
+    beta_centre: Vector3<f64>,
+}
+
+impl<T> SimWorld<T> {
+    /// Whether an estimate, its scale included, is right: as [`World::is_right`].
+    pub fn is_right(&self, t_alpha_beta: &Sim3) -> bool {
+        let error = self.t_alpha_beta.inverse() * *t_alpha_beta;
+        let shift = (*t_alpha_beta * self.beta_centre - self.t_alpha_beta * self.beta_centre).norm();
+        error.rotation.angle() < RIGHT_RAD && shift < RIGHT_M
+    }
 }
 
 impl World {
@@ -158,6 +171,7 @@ impl World {
             beta,
             alignments,
             t_alpha_beta: Sim3::new(truth.rotation, truth.translation, unit),
+            beta_centre: self.beta_centre / unit,
         }
     }
 }
