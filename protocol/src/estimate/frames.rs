@@ -4,20 +4,25 @@
 //! Every alignment is one hypothesis; nothing is sampled. Pair distances under relative trajectory covariances give a
 //! graph of agreement at each of 5 covariance scales in [1, 3]. The largest cliques of each are settled: joint least
 //! squares with cross-covariances, and a leave-one-out χ² test, marginalised over the scale, that drops what the others
-//! do not predict. What is settled is compared by number of false alarms (NFA), the tighter first: a set must gain by each
-//! member that it adds, and a union of two sets that contradict each other must beat the two apart. Frames merge at
-//! NFA < 1e-4 and 3 alignments, unless a rival that contradicts the best has about as many members. Same set of
-//! alignments, same answer to the bit, in any order.
+//! do not predict. The settled sets are candidates of an explanation: one set that speaks of one transform, or two that
+//! speak of two, by σ-marginalised evidence of their stacked residuals. Frames merge at a number of false alarms (NFA)
+//! < 1e-4 and 3 alignments, unless a second set has about as many members as the first. Same set of alignments, same
+//! answer to the bit, in any order.
 //!
-//! *Measured*, see `merganser-sim bench frames`.
+//! *Measured* by `merganser-sim bench frames` over thousands of worlds: 4 true alignments against 3 of one lie merge
+//! rightly in 99.2 to 99.8 %, 4 against 4 are ambiguous in 99.9 to 100 %. The NFA alone, without evidence, reaches 97 and
+//! merges 0.3 % of the former wrongly; the prototype of MATH §5, over 400 worlds, 97.8 and 2.3 %.
 
 mod clique;
 mod decide;
+mod evidence;
+mod explain;
 mod gls;
 mod hypothesis;
 mod measured;
 mod pairs;
 mod predict;
+mod scaled;
 #[cfg(test)]
 mod tests;
 #[doc(hidden)]
@@ -27,6 +32,7 @@ use super::trajectory::Trajectory;
 use crate::config::EstimateConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
 use measured::Measured;
+pub use scaled::SimMeasurement;
 
 /// Alignments between two frames considered at most. Of more, this many are taken evenly along the first frame: a rule
 /// deaf to what an alignment claims about itself.
@@ -84,6 +90,12 @@ pub enum FrameOutcome<T = PoseWithCovariance> {
         /// Its rival.
         rival: FrameConsensus<T>,
     },
+    /// What agrees does not give the frames' scale: no alignment measures it, and the baseline between them is too short
+    /// for the scale.
+    BaselineTooShort {
+        /// Standard deviation of log-scale that the baselines support.
+        log_scale_sigma: f64,
+    },
     /// Several alignments, and no set of them agrees better than chance.
     Inconsistent,
 }
@@ -137,21 +149,22 @@ pub fn align_frames(
     alignments: &[PairAlignment],
     config: &FrameConsensusConfig,
 ) -> FrameOutcome {
-    let rigid = alignments.iter().map(|a| (a.i, a.j, a.t_i_j.pose, a.t_i_j.covariance));
+    let rigid = alignments.iter().map(|a| (a.i, a.j, (a.t_i_j.pose, a.t_i_j.covariance, true)));
     Measured::<6, Se3>::new(alpha, beta, rigid, config)
         .outcome()
         .map(|pose, covariance| PoseWithCovariance { pose, covariance })
 }
 
-/// Aligns two frames of which at least one has unknown scale: `t_alpha_beta` is a similarity, and every alignment
-/// measures scale itself. The same machinery with 7 degrees of freedom.
-pub fn align_frames_sim(
+/// Aligns two frames of which at least one has unknown scale: `t_alpha_beta` is a similarity. Alignments measure scale
+/// themselves, or leave it to the baselines between them; see [`SimMeasurement`]. The same machinery with 7 degrees of
+/// freedom.
+pub fn align_frames_sim<T: Copy + Into<SimMeasurement>>(
     alpha: &Trajectory,
     beta: &Trajectory,
-    alignments: &[PairAlignment<SimWithCovariance>],
+    alignments: &[PairAlignment<T>],
     config: &FrameConsensusConfig,
 ) -> FrameOutcome<SimWithCovariance> {
-    let similar = alignments.iter().map(|a| (a.i, a.j, a.t_i_j.sim, a.t_i_j.covariance));
+    let similar = alignments.iter().map(|a| (a.i, a.j, a.t_i_j.into().parts()));
     Measured::<7, Sim3>::new(alpha, beta, similar, config)
         .outcome()
         .map(|sim, covariance| SimWithCovariance { sim, covariance })
@@ -170,6 +183,7 @@ impl<G, const N: usize> FrameOutcome<(G, Covariance<N>)> {
             Self::Merged(c) => FrameOutcome::Merged(map(c)),
             Self::Provisional(c) => FrameOutcome::Provisional(map(c)),
             Self::Ambiguous { best, rival } => FrameOutcome::Ambiguous { best: map(best), rival: map(rival) },
+            Self::BaselineTooShort { log_scale_sigma } => FrameOutcome::BaselineTooShort { log_scale_sigma },
             Self::Inconsistent => FrameOutcome::Inconsistent,
         }
     }

@@ -217,7 +217,9 @@ impl Outcome {
             FrameOutcome::Provisional(c) => (PairStatus::Provisional, Some(c)),
             // Neither of two rivals is worth showing as the answer.
             FrameOutcome::Ambiguous { .. } => (PairStatus::Ambiguous, None),
-            FrameOutcome::Inconsistent | FrameOutcome::None => (PairStatus::Inconsistent, None),
+            FrameOutcome::BaselineTooShort { .. } | FrameOutcome::Inconsistent | FrameOutcome::None => {
+                (PairStatus::Inconsistent, None)
+            }
         };
         match consensus {
             Some(c) => Self {

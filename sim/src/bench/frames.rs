@@ -1,8 +1,10 @@
 //! The frame-level consensus on seeded worlds: MATH §5's table with refusals, wrong merges and the covariance's honesty.
 
-use merganser_protocol::estimate::frames::world::{Draw, World};
-use merganser_protocol::estimate::frames::{FrameConsensusConfig, FrameOutcome, align_frames, align_frames_sim};
-use merganser_protocol::geometry::{Covariance, Se3};
+use merganser_protocol::estimate::frames::world::{Draw, SimWorld, World};
+use merganser_protocol::estimate::frames::{
+    FrameConsensusConfig, FrameOutcome, SimMeasurement, align_frames, align_frames_sim,
+};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, SimWithCovariance};
 use nalgebra::SVector;
 use std::fmt::Write;
 use std::ops::Range;
@@ -24,6 +26,17 @@ pub enum Goal {
     Honest,
 }
 
+/// The unit of the second frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Unit {
+    /// Metres.
+    Metre,
+    /// Unknown; each alignment measures it.
+    Measured,
+    /// Unknown; only the baselines between alignments give it.
+    Unmeasured,
+}
+
 /// One row: worlds of one kind, one configuration.
 #[derive(Clone, Debug)]
 pub struct Cell {
@@ -32,7 +45,7 @@ pub struct Cell {
     draw: Draw,
     /// Largest covariance scale tried.
     scale_max: f64,
-    unknown_scale: bool,
+    unit: Unit,
     /// What must be reached.
     pub goal: Goal,
 }
@@ -54,6 +67,8 @@ pub struct Tally {
     pub shown_wrong: u32,
     /// Called ambiguous.
     pub ambiguous: u32,
+    /// Refused for want of a baseline that gives the scale.
+    pub short: u32,
     /// No set of alignments agreed.
     pub inconsistent: u32,
     /// Merged with a false alignment among those used.
@@ -65,9 +80,10 @@ pub struct Tally {
 /// MATH §5's cells, at both scales, and what else must hold.
 pub fn cells() -> Vec<Cell> {
     let draw = |real, aliased, random| Draw { real, aliased, random, under_reported: 1.0 };
-    let cell = |name, draw, scale_max, goal| Cell { name, draw, scale_max, unknown_scale: false, goal };
+    let cell = |name, draw, scale_max, goal| Cell { name, draw, scale_max, unit: Unit::Metre, goal };
     let under_reported = Draw { under_reported: 3.0, ..draw(4, 0, 16) };
-    let similar = |name, draw, goal| Cell { name, draw, scale_max: 3.0, unknown_scale: true, goal };
+    let similar = |name, draw, goal| Cell { name, draw, scale_max: 3.0, unit: Unit::Measured, goal };
+    let unscaled = |name, draw, goal| Cell { name, draw, scale_max: 3.0, unit: Unit::Unmeasured, goal };
     vec![
         cell("80 % false", draw(4, 0, 16), 1.0, Goal::Right(100.0)),
         cell("80 % false", draw(4, 0, 16), 3.0, Goal::Right(100.0)),
@@ -89,6 +105,10 @@ pub fn cells() -> Vec<Cell> {
         cell("10 true of 50", draw(10, 0, 40), 3.0, Goal::Honest),
         similar("SIM(3), 80 % false", draw(4, 0, 16), Goal::Right(99.0)),
         similar("SIM(3), 10 true", draw(10, 0, 0), Goal::Honest),
+        unscaled("SIM(3) by baselines, 80 % false", draw(4, 0, 16), Goal::Right(99.0)),
+        unscaled("SIM(3) by baselines, 50 % false", draw(10, 0, 10), Goal::Honest),
+        unscaled("SIM(3) by baselines, 10 true", draw(10, 0, 0), Goal::Honest),
+        unscaled("SIM(3) by baselines, all false", draw(0, 0, 20), Goal::Nothing),
     ]
 }
 
@@ -98,13 +118,14 @@ pub fn measure(cell: &Cell, seeds: Range<u64>, mut done: impl FnMut()) -> Tally 
     let mut tally = Tally::default();
     for seed in seeds {
         let world = World::new(seed, cell.draw);
-        if cell.unknown_scale {
-            let sim = world.clone().with_unknown_scale(seed);
-            let outcome = align_frames_sim(&sim.alpha, &sim.beta, &sim.alignments, &config);
-            tally.add(&world, outcome, |t| &t.covariance, |t| (t.sim.to_se3(), t.sim.local(&sim.t_alpha_beta)));
-        } else {
-            let outcome = align_frames(&world.alpha, &world.beta, &world.alignments, &config);
-            tally.add(&world, outcome, |t| &t.covariance, |t| (t.pose, t.pose.local(&world.t_alpha_beta)));
+        match cell.unit {
+            Unit::Metre => {
+                let outcome = align_frames(&world.alpha, &world.beta, &world.alignments, &config);
+                let judge = |t: &PoseWithCovariance| (world.is_right(&t.pose), t.pose.local(&world.t_alpha_beta));
+                tally.add(&world, outcome, |t| &t.covariance, judge);
+            }
+            Unit::Measured => tally.add_sim(&world, &world.with_unknown_scale(seed), &config),
+            Unit::Unmeasured => tally.add_sim(&world, &world.with_unmeasured_scale(seed), &config),
         }
         done();
     }
@@ -112,20 +133,31 @@ pub fn measure(cell: &Cell, seeds: Range<u64>, mut done: impl FnMut()) -> Tally 
 }
 
 impl Tally {
+    fn add_sim<T: Copy + Into<SimMeasurement>>(
+        &mut self,
+        world: &World,
+        sim: &SimWorld<T>,
+        config: &FrameConsensusConfig,
+    ) {
+        let outcome = align_frames_sim(&sim.alpha, &sim.beta, &sim.alignments, config);
+        let judge = |t: &SimWithCovariance| (sim.is_right(&t.sim), t.sim.local(&sim.t_alpha_beta));
+        self.add(world, outcome, |t| &t.covariance, judge);
+    }
+
     fn add<const N: usize, T>(
         &mut self,
         world: &World,
         outcome: FrameOutcome<T>,
         covariance: impl Fn(&T) -> &Covariance<N>,
-        error: impl Fn(&T) -> (Se3, SVector<f64, N>),
+        judge: impl Fn(&T) -> (bool, SVector<f64, N>),
     ) {
         self.worlds += 1;
         match outcome {
             FrameOutcome::Merged(c) => {
-                let (pose, error) = error(&c.t_alpha_beta);
+                let (right, error) = judge(&c.t_alpha_beta);
                 let distance_squared = covariance(&c.t_alpha_beta).mahalanobis_squared(&error);
                 let with_false = c.used.iter().any(|&k| !world.real[k]);
-                *match (world.is_right(&pose), with_false) {
+                *match (right, with_false) {
                     (true, _) => &mut self.merged_right,
                     (false, false) => &mut self.merged_weak,
                     (false, true) => &mut self.merged_wrong,
@@ -135,10 +167,11 @@ impl Tally {
                 self.inside += u32::from(distance_squared < CHI2_95[N - 6]);
             }
             FrameOutcome::Provisional(c) => {
-                let right = world.is_right(&error(&c.t_alpha_beta).0);
+                let (right, _) = judge(&c.t_alpha_beta);
                 *(if right { &mut self.shown_right } else { &mut self.shown_wrong }) += 1;
             }
             FrameOutcome::Ambiguous { .. } => self.ambiguous += 1,
+            FrameOutcome::BaselineTooShort { .. } => self.short += 1,
             FrameOutcome::Inconsistent | FrameOutcome::None => self.inconsistent += 1,
         }
     }
@@ -186,8 +219,21 @@ impl Cell {
 /// The table.
 pub fn table(cells: &[Cell], measured: &[Tally]) -> String {
     let mut text = format!(
-        "{:<30} {:>3} {:>12} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6}\n",
-        "%", "f", "goal", "right", "merged", "weak", "WRONG", "false", "shown", "ambig.", "none", "ANEES", "in 95"
+        "{:<32} {:>3} {:>12} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6}\n",
+        "%",
+        "f",
+        "goal",
+        "right",
+        "merged",
+        "weak",
+        "WRONG",
+        "false",
+        "shown",
+        "ambig.",
+        "short",
+        "none",
+        "ANEES",
+        "in 95"
     );
     for (cell, tally) in cells.iter().zip(measured) {
         let goal = match cell.goal {
@@ -199,7 +245,7 @@ pub fn table(cells: &[Cell], measured: &[Tally]) -> String {
         let p = |count| format!("{:.1}", tally.percent(count));
         let _ = writeln!(
             text,
-            "{:<30} {:>3} {goal:>12} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6.2} {:>6.1}  {}",
+            "{:<32} {:>3} {goal:>12} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6.2} {:>6.1}  {}",
             cell.name,
             cell.scale_max,
             p(tally.merged_right + tally.shown_right),
@@ -209,6 +255,7 @@ pub fn table(cells: &[Cell], measured: &[Tally]) -> String {
             p(tally.with_false),
             p(tally.shown_wrong),
             p(tally.ambiguous),
+            p(tally.short),
             p(tally.inconsistent),
             tally.anees(),
             tally.coverage(),
@@ -217,5 +264,6 @@ pub fn table(cells: &[Cell], measured: &[Tally]) -> String {
     }
     text + "\nright: within 8° and 3 m, merged or (with fewer alignments than a merge needs) shown as provisional\n\
             weak:  merged further off, on true alignments alone; WRONG: merged further off, and not on those alone\n\
-            false: merged with a false alignment among those used; shown: provisional and further off\n"
+            false: merged with a false alignment among those used; shown: provisional and further off\n\
+            short: refused, baseline too short for the scale\n"
 }

@@ -4,8 +4,9 @@
 
 use super::clique::{self, Set};
 use super::measured::{Alignment, Measured};
+use super::scaled::Scaled;
 use crate::estimate::residual::Residual;
-use crate::geometry::Group;
+use libm::log;
 use nalgebra::{DMatrix, Dyn, SMatrix, SVector, linalg::Cholesky};
 
 /// Gauss–Newton steps at most; from a member's own hypothesis three or four suffice.
@@ -18,30 +19,41 @@ pub(super) struct Gls<const N: usize, G> {
     pub(super) t_alpha_beta: G,
     /// Covariance of its local perturbation, before any scale.
     pub(super) covariance: SMatrix<f64, N, N>,
-    /// χ² of the residuals, with N (members − 1) degrees of freedom.
+    /// χ² of the residuals.
     pub(super) chi_squared: f64,
-    /// Squared Mahalanobis distance of each member, in the set's order, from its best prediction by all others (trajectory
-    /// correlations included): χ² with N degrees of freedom. Empty for a single member.
-    pub(super) left_out: Vec<f64>,
+    /// Its degrees of freedom: all values measured less those of T_αβ.
+    pub(super) freedom: usize,
+    /// ln √(|C| |Jᵀ C⁻¹ J|), of the residuals' covariance C: what the residuals' density and the freedom to choose T_αβ cost.
+    pub(super) log_sqrt_det: f64,
+    /// Each member as the others predict it, in the set's order. Empty for a single member.
+    pub(super) left_out: Vec<LeftOut>,
 }
 
-impl<const N: usize, G: Group<N>> Gls<N, G> {
-    /// χ² without a member that lies `distance_squared` from what the others predict, and its degrees of freedom.
-    pub(super) fn others(&self, distance_squared: f64) -> (f64, f64) {
-        let freedom = N * self.left_out.len().saturating_sub(2);
-        ((self.chi_squared - distance_squared).max(0.0), freedom as f64)
+/// A member of a set as all the others predict it, trajectory correlations included.
+#[derive(Clone, Copy)]
+pub(super) struct LeftOut {
+    /// Squared Mahalanobis distance from the prediction: χ² with as many degrees of freedom as the member measures.
+    pub(super) distance_squared: f64,
+    /// ln √det of the prediction's covariance, the member's own included.
+    pub(super) log_sqrt_det: f64,
+}
+
+impl<const N: usize, G: Scaled<N>> Gls<N, G> {
+    /// χ² without a member of `dimension` values that lies `distance_squared` from what the others predict, and its degrees
+    /// of freedom.
+    pub(super) fn others(&self, distance_squared: f64, dimension: usize) -> (f64, f64) {
+        ((self.chi_squared - distance_squared).max(0.0), self.freedom.saturating_sub(dimension) as f64)
     }
 
-    /// Solves over `set`, starting from member `hub`'s hypothesis. `None` where the covariance is numerically singular
+    /// Solves over `set`, starting from `t_alpha_beta`. `None` where the covariance is numerically singular
     /// or the iteration runs away.
-    pub(super) fn solve(measured: &Measured<'_, N, G>, set: Set, hub: usize) -> Option<Self> {
+    pub(super) fn solve(measured: &Measured<'_, N, G>, set: Set, mut t_alpha_beta: G) -> Option<Self> {
         let members: Vec<&Alignment<N, G>> = clique::vertices(set).map(|l| &measured.alignments[l]).collect();
-        let mut t_alpha_beta = measured.hypothesis(&measured.alignments[hub])?;
         let mut system = System::new(measured, &members, &t_alpha_beta)?;
         for _ in 0..ITERATIONS_MAX {
             let step = system.covariance * system.gradient;
             t_alpha_beta = t_alpha_beta.retract(&-step);
-            if !step.iter().all(|x| x.is_finite()) {
+            if !step.iter().all(|x| x.is_finite()) || !(1e-6..1e6).contains(&t_alpha_beta.scale()) {
                 return None;
             }
             system = System::new(measured, &members, &t_alpha_beta)?;
@@ -55,6 +67,8 @@ impl<const N: usize, G: Group<N>> Gls<N, G> {
             t_alpha_beta,
             covariance: system.covariance,
             chi_squared: system.h.column(0).norm_squared() - explained,
+            freedom: members.iter().map(|m| m.dimension()).sum::<usize>().saturating_sub(N),
+            log_sqrt_det: system.log_sqrt_det(),
             left_out,
         })
     }
@@ -74,27 +88,33 @@ struct System<const N: usize> {
 }
 
 impl<const N: usize> System<N> {
-    fn new<G: Group<N>>(measured: &Measured<'_, N, G>, members: &[&Alignment<N, G>], t_alpha_beta: &G) -> Option<Self> {
-        let residuals: Vec<Residual<N>> = members
+    fn new<G: Scaled<N>>(
+        measured: &Measured<'_, N, G>,
+        members: &[&Alignment<N, G>],
+        t_alpha_beta: &G,
+    ) -> Option<Self> {
+        let residuals: Vec<(Residual<N>, SMatrix<f64, N, N>)> = members
             .iter()
             .map(|m| {
                 let (t_alpha_i, t_beta_j) = (measured.alpha.pose(m.i)?, measured.beta.pose(m.j)?);
-                Some(Residual::new(&G::embed(&t_alpha_i), &m.t_i_j, t_alpha_beta, &G::embed(&t_beta_j)))
+                let (t_i_j, sigma) = m.at(t_alpha_beta.scale());
+                let r = Residual::new(&G::embed(&t_alpha_i), &t_i_j, t_alpha_beta, &G::embed(&t_beta_j));
+                Some((r, sigma))
             })
             .collect::<Option<_>>()?;
         let rows = N * members.len();
         let mut c = DMatrix::<f64>::zeros(rows, rows);
         let (mut j, mut h) = (DMatrix::zeros(rows, N), DMatrix::zeros(rows, 1));
-        for (b, (rb, mb)) in residuals.iter().zip(members).enumerate() {
+        for (b, ((rb, _), mb)) in residuals.iter().zip(members).enumerate() {
             j.fixed_view_mut::<N, N>(N * b, 0).copy_from(&rb.j_alpha_beta);
             h.fixed_view_mut::<N, 1>(N * b, 0).copy_from(&rb.h);
             // The factorisation reads the lower triangle only.
-            for (a, (ra, ma)) in residuals.iter().zip(members).enumerate().skip(b) {
+            for (a, ((ra, sigma), ma)) in residuals.iter().zip(members).enumerate().skip(b) {
                 let of_alpha = G::embed_covariance(&measured.alpha.cross_covariance(ma.i, mb.i)?);
                 let of_beta = G::embed_covariance(&measured.beta.cross_covariance(ma.j, mb.j)?);
                 let mut block = ra.j_i * of_alpha * rb.j_i.transpose() + ra.j_j * of_beta * rb.j_j.transpose();
                 if a == b {
-                    block += ra.j_ij * ma.covariance.matrix() * ra.j_ij.transpose();
+                    block += ra.j_ij * sigma * ra.j_ij.transpose();
                 }
                 c.fixed_view_mut::<N, N>(N * a, N * b).copy_from(&block);
             }
@@ -109,13 +129,20 @@ impl<const N: usize> System<N> {
         Some(Self { factor, j, h, gradient, covariance })
     }
 
+    /// ln √(|C| |Jᵀ C⁻¹ J|).
+    fn log_sqrt_det(&self) -> f64 {
+        let of_c: f64 = self.factor.l_dirty().diagonal().iter().map(|&x| log(x)).sum();
+        let of_covariance = self.covariance.cholesky().map(|f| f.l_dirty().diagonal().iter().map(|&x| log(x)).sum());
+        of_c - of_covariance.unwrap_or(f64::NEG_INFINITY)
+    }
+
     /// With the projected information P = C⁻¹ − C⁻¹J (JᵀC⁻¹J)⁻¹ JᵀC⁻¹, member l's prediction by the others is off by
     /// P_ll⁻¹ (P h)_l with covariance P_ll⁻¹, so d² = (P h)_lᵀ P_ll⁻¹ (P h)_l: one factorisation serves all.
-    fn left_out(&self, members: usize) -> Vec<f64> {
+    fn left_out(&self, members: usize) -> Vec<LeftOut> {
         let rows = N * members;
         let mut l_inv = DMatrix::<f64>::identity(rows, rows);
         if !self.factor.l_dirty().solve_lower_triangular_mut(&mut l_inv) {
-            return vec![f64::INFINITY; members];
+            return vec![LeftOut { distance_squared: f64::INFINITY, log_sqrt_det: f64::INFINITY }; members];
         }
         // L⁻¹ (h − J x̂)
         let fit = self.covariance * self.gradient;
@@ -130,7 +157,12 @@ impl<const N: usize> System<N> {
                 let c_inv = SMatrix::<f64, N, N>::from_fn(|r, c| column(r).dot(&column(c)));
                 let p = c_inv - of_j * self.covariance * of_j.transpose();
                 let p_h = SVector::<f64, N>::from_fn(|r, _| column(r).dot(&unexplained));
-                p.cholesky().map_or(f64::INFINITY, |f| f.solve(&p_h).dot(&p_h))
+                p.cholesky().map_or(LeftOut { distance_squared: f64::INFINITY, log_sqrt_det: f64::INFINITY }, |f| {
+                    LeftOut {
+                        distance_squared: f.solve(&p_h).dot(&p_h),
+                        log_sqrt_det: -f.l_dirty().diagonal().iter().map(|&x| log(x)).sum::<f64>(),
+                    }
+                })
             })
             .collect()
     }

@@ -6,49 +6,42 @@ use super::gls::Gls;
 use super::measured::Measured;
 use super::pairs::Pairs;
 use super::predict::surprise;
-use crate::geometry::{Covariance, Group};
+use super::scaled::{LOG_SCALE_SIGMA_MAX, Scaled, log_scale_sigma};
+use crate::geometry::Covariance;
 
 /// A member this improbable, given what the others predict, is none.
 const SURPRISE_MIN: f64 = 1e-3;
 /// A settled set of alignments.
 pub(super) struct Hypothesis<const N: usize, G> {
     pub(super) set: Set,
-    /// Covariance scale of the gate that found it.
-    pub(super) scale: f64,
     pub(super) log10_nfa: f64,
-    /// Of the sets found at that gate, whether it was the largest.
-    pub(super) largest: bool,
     gls: Gls<N, G>,
 }
 
-impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
+impl<const N: usize, G: Scaled<N>> Hypothesis<N, G> {
     /// Estimates over `set`; drops, worst first, members that the others do not predict.
-    pub(super) fn settle(
-        measured: &Measured<'_, N, G>,
-        pairs: &Pairs,
-        mut set: Set,
-        scale: f64,
-        largest: bool,
-    ) -> Option<Self> {
+    pub(super) fn settle(measured: &Measured<'_, N, G>, pairs: &Pairs, mut set: Set) -> Option<Self> {
         loop {
-            let (log10_nfa, hub) = pairs.log10_nfa::<N>(set, measured.search_volume());
-            let gls = Gls::solve(measured, set, hub)?;
+            let (log10_nfa, hub) = pairs.log10_nfa(measured, set);
+            let gls = Gls::solve(measured, set, start(measured, pairs, set, hub)?)?;
             match unpredicted(measured, set, &gls) {
-                0 => return Some(Self { set, scale, log10_nfa, largest, gls }),
+                0 => return Some(Self { set, log10_nfa, gls }),
                 some => set &= !some,
             }
         }
     }
 
-    /// Squared distance of member `l` from what the others predict.
-    pub(super) fn left_out(&self, l: usize) -> f64 {
-        self.gls.left_out.get((self.set & (bit(l) - 1)).count_ones() as usize).copied().unwrap_or(0.0)
+    /// Standard deviation of log-scale, where no member measures scale and their baselines are too short for it.
+    pub(super) fn lacks_scale(&self, measured: &Measured<'_, N, G>) -> Option<f64> {
+        let unmeasured = clique::vertices(self.set).all(|l| !measured.alignments[l].measures_scale);
+        let sigma = log_scale_sigma(&self.gls.covariance);
+        (unmeasured && sigma > LOG_SCALE_SIGMA_MAX).then_some(sigma)
     }
 
     /// As an answer to the caller.
     pub(super) fn consensus(&self, measured: &Measured<'_, N, G>) -> FrameConsensus<(G, Covariance<N>)> {
         let scale_max = measured.config.covariance_scale_max.max(1.0);
-        let freedom = N as f64 * f64::from(self.set.count_ones() - 1).max(1.0);
+        let freedom = self.gls.freedom.max(1) as f64;
         // A χ² that chance exceeds once in fifty times says nothing against the stated covariances.
         let excess = self.gls.chi_squared / freedom;
         let significant = excess > 1.0 + 2.33 * (2.0 / freedom).sqrt();
@@ -64,15 +57,29 @@ impl<const N: usize, G: Group<N>> Hypothesis<N, G> {
     }
 }
 
+/// T_αβ as member `hub` of `set` has it.
+pub(super) fn start<const N: usize, G: Scaled<N>>(
+    measured: &Measured<'_, N, G>,
+    pairs: &Pairs,
+    set: Set,
+    hub: usize,
+) -> Option<G> {
+    measured.hypothesis(&measured.alignments[hub], pairs.scale(hub, set))
+}
+
 /// The worst of the members that the others do not predict: a sixteenth of the set, but at least one, at a time, since
 /// one bad member spoils the prediction of others. Two members always stay.
-fn unpredicted<const N: usize, G: Group<N>>(measured: &Measured<'_, N, G>, set: Set, gls: &Gls<N, G>) -> Set {
+fn unpredicted<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, set: Set, gls: &Gls<N, G>) -> Set {
     let scales = measured.scales();
     let mut outside: Vec<(f64, usize)> = gls
         .left_out
         .iter()
         .zip(clique::vertices(set))
-        .map(|(&d2, l)| (surprise::<N>(d2, gls.others(d2), &scales), l))
+        .map(|(left_out, l)| {
+            let d2 = left_out.distance_squared;
+            let dimension = measured.alignments[l].dimension();
+            (surprise(dimension, d2, gls.others(d2, dimension), &scales), l)
+        })
         .filter(|&(p, _)| p < SURPRISE_MIN)
         .collect();
     outside.sort_by(|a, b| a.0.total_cmp(&b.0));

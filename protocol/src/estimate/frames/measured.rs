@@ -1,16 +1,15 @@
 //! All that was measured between two frames, in an order that does not depend on the caller's: the same set of
 //! alignments gives the same answer to the bit.
 
+use super::scaled::{LOG_SCALE_RANGE, Scaled};
 use super::{ALIGNMENTS_MAX, FrameConsensusConfig, Rotations};
 use crate::estimate::trajectory::Trajectory;
-use crate::geometry::{Covariance, Group};
+use crate::geometry::Covariance;
 use core::f64::consts::PI;
 use libm::pow;
 
 /// Covariance scales tried, log-spaced from 1 to the configured largest.
 pub(super) const SCALES: usize = 5;
-/// ln 400: the range of scales, 0.05 to 20, over which a false similarity may fall.
-const LOG_SCALE_RANGE: f64 = 5.991_464_547_107_982;
 
 /// An alignment in either group, and where the caller had it.
 pub(super) struct Alignment<const N: usize, G> {
@@ -18,6 +17,8 @@ pub(super) struct Alignment<const N: usize, G> {
     pub(super) j: usize,
     pub(super) t_i_j: G,
     pub(super) covariance: Covariance<N>,
+    /// Or `t_i_j` is at scale 1, to be taken [`Alignment::at`] another.
+    pub(super) measures_scale: bool,
     pub(super) position: usize,
 }
 
@@ -27,22 +28,30 @@ pub(super) struct Measured<'a, const N: usize, G> {
     pub(super) beta: &'a Trajectory,
     pub(super) alignments: Vec<Alignment<N, G>>,
     pub(super) config: &'a FrameConsensusConfig,
+    /// Volumes of the boxes around either trajectory, each in its own unit.
+    boxes: [f64; 2],
 }
 
-impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
+/// Log-spaced from 1 to `largest`.
+pub(super) fn scales_to(largest: f64) -> [f64; SCALES] {
+    let step = 1.0 / (SCALES - 1) as f64;
+    core::array::from_fn(|k| pow(largest, k as f64 * step))
+}
+
+impl<'a, const N: usize, G: Scaled<N>> Measured<'a, N, G> {
     /// Sorts, drops exact duplicates and alignments past either trajectory's end, and thins to [`ALIGNMENTS_MAX`].
     pub(super) fn new(
         alpha: &'a Trajectory,
         beta: &'a Trajectory,
-        alignments: impl Iterator<Item = (usize, usize, G, Covariance<N>)>,
+        alignments: impl Iterator<Item = (usize, usize, (G, Covariance<N>, bool))>,
         config: &'a FrameConsensusConfig,
     ) -> Self {
         let mut keyed: Vec<(Vec<f64>, Alignment<N, G>)> = alignments
             .enumerate()
             .filter(|(_, (i, j, ..))| *i < alpha.len() && *j < beta.len())
-            .map(|(position, (i, j, t_i_j, covariance))| {
+            .map(|(position, (i, j, (t_i_j, covariance, measures_scale)))| {
                 let key = t_i_j.log().iter().chain(covariance.matrix().iter()).copied().collect();
-                (key, Alignment { i, j, t_i_j, covariance, position })
+                (key, Alignment { i, j, t_i_j, covariance, measures_scale, position })
             })
             .collect();
         let order = |(a_key, a): &(Vec<f64>, Alignment<N, G>), (b_key, b): &(Vec<f64>, Alignment<N, G>)| {
@@ -56,31 +65,32 @@ impl<'a, const N: usize, G: Group<N>> Measured<'a, N, G> {
         let kept = n.min(ALIGNMENTS_MAX);
         let mut taken = (0..kept).map(|k| k * n / kept).peekable();
         let thinned = keyed.into_iter().enumerate().filter(|(k, _)| taken.next_if_eq(k).is_some());
-        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config }
+        let volume = |t: &Trajectory| t.extent().map(|edge| edge.max(config.search_edge_min)).product();
+        let boxes = [volume(alpha), volume(beta)];
+        Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config, boxes }
     }
 
     /// The covariance scales tried, ascending from 1.
     pub(super) fn scales(&self) -> [f64; SCALES] {
-        let step = 1.0 / (SCALES - 1) as f64;
-        core::array::from_fn(|k| pow(self.config.covariance_scale_max.max(1.0), k as f64 * step))
+        scales_to(self.config.covariance_scale_max.max(1.0))
     }
 
-    /// Volume into which chance would spread residuals: the box around the smaller trajectory (β's for similarities,
-    /// whose residuals are in β's units), times rotations, times the range of log-scale.
-    pub(super) fn search_volume(&self) -> f64 {
-        let of = |t: &Trajectory| t.extent().map(|edge| edge.max(self.config.search_edge_min)).product();
-        let (alpha, beta): (f64, f64) = (of(self.alpha), of(self.beta));
-        let (translations, scales) = if N == 7 { (beta, LOG_SCALE_RANGE) } else { (alpha.min(beta), 1.0) };
+    /// Volume into which chance would spread residuals where the frames' scale is `scale`: the box around the smaller
+    /// trajectory in β's unit, that of residuals, times rotations, times the range of log-scale. A scale that shrinks α
+    /// shrinks its box with the residuals, so that shrinking never wins.
+    pub(super) fn search_volume(&self, scale: f64) -> f64 {
+        let [alpha, beta] = self.boxes;
         let rotations = match self.config.rotations {
             Rotations::Heading => 2.0 * PI * 0.4 * 0.4,
             Rotations::All => 8.0 * PI * PI,
         };
-        translations * rotations * scales
+        let scales = if N == 7 { LOG_SCALE_RANGE } else { 1.0 };
+        (alpha / (scale * scale * scale)).min(beta) * rotations * scales
     }
 
-    /// T_αβ as alignment `a` alone gives it.
-    pub(super) fn hypothesis(&self, a: &Alignment<N, G>) -> Option<G> {
+    /// T_αβ as alignment `a` gives it, at `scale` where it does not measure one.
+    pub(super) fn hypothesis(&self, a: &Alignment<N, G>, scale: f64) -> Option<G> {
         let (t_alpha_i, t_beta_j) = (self.alpha.pose(a.i)?, self.beta.pose(a.j)?);
-        Some(G::embed(&t_alpha_i) * a.t_i_j * G::embed(&t_beta_j).inverse())
+        Some(G::embed(&t_alpha_i) * a.at(scale).0 * G::embed(&t_beta_j).inverse())
     }
 }

@@ -6,7 +6,7 @@ use super::PairAlignment;
 use crate::estimate::trajectory::Trajectory;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3, se3};
 use core::f64::consts::PI;
-use libm::{cos, sin};
+use libm::{cos, exp, log, sin};
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3, Vector6};
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -15,6 +15,9 @@ use rand_chacha::ChaCha8Rng;
 const ANCHORS: usize = 150;
 const ODOMETRY_SIGMAS: [f64; 2] = [0.02, 0.003];
 const ALIGNMENT_SIGMAS: [f64; 2] = [0.05, 0.01];
+/// Errors below which an estimate is right, 8° and 3 m.
+const RIGHT_RAD: f64 = 8.0 * PI / 180.0;
+const RIGHT_M: f64 = 3.0;
 
 /// What is drawn.
 #[derive(Clone, Copy, Debug)]
@@ -95,7 +98,7 @@ impl World {
     pub fn is_right(&self, t_alpha_beta: &Se3) -> bool {
         let error = self.t_alpha_beta.inverse() * *t_alpha_beta;
         let shift = (error * self.beta_centre - self.beta_centre).norm();
-        error.rotation.angle() < 8.0_f64.to_radians() && shift < 3.0
+        error.rotation.angle() < RIGHT_RAD && shift < RIGHT_M
     }
 
     /// Normalised estimation error squared.
@@ -104,25 +107,54 @@ impl World {
     }
 }
 
-/// A [`World`] whose β is in units of its own.
+/// A [`World`] whose β is in units of its own; `T` is what an alignment measures.
 #[derive(Clone, Debug)]
-pub struct SimWorld {
+pub struct SimWorld<T> {
     /// α's odometry, m.
     pub alpha: Trajectory,
     /// β's odometry, in its own unit.
     pub beta: Trajectory,
     /// Alignments, true and false.
-    pub alignments: Vec<PairAlignment<SimWithCovariance>>,
+    pub alignments: Vec<PairAlignment<T>>,
     /// The truth.
     pub t_alpha_beta: Sim3,
+    beta_centre: Vector3<f64>,
+}
+
+impl<T> SimWorld<T> {
+    /// Whether an estimate, its scale included, is right: as [`World::is_right`].
+    pub fn is_right(&self, t_alpha_beta: &Sim3) -> bool {
+        let error = self.t_alpha_beta.inverse() * *t_alpha_beta;
+        let shift = (*t_alpha_beta * self.beta_centre - self.t_alpha_beta * self.beta_centre).norm();
+        error.rotation.angle() < RIGHT_RAD && shift < RIGHT_M
+    }
 }
 
 impl World {
     /// The same world, β's unit drawn between 0.2 and 5 m; true alignments measure it to 3 %, false ones tell any.
-    pub fn with_unknown_scale(&self, seed: u64) -> SimWorld {
+    pub fn with_unknown_scale(&self, seed: u64) -> SimWorld<SimWithCovariance> {
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
-        let unit = libm::exp(uniform(rng, -1.6, 1.6));
+        let unit = exp(uniform(rng, -1.6, 1.6));
         // A length in metres is 1/unit of β's; so are translations' standard deviations.
+        let [m, r] = ALIGNMENT_SIGMAS;
+        let of_alignment = covariance_of([m / unit, m / unit, m / unit, r, r, r, 0.03]);
+        let alignments = self.alignments.iter().zip(&self.real).map(|(a, &real)| {
+            let told = if real { 0.03 * normal(rng) } else { uniform(rng, -1.0, 1.0) };
+            let sim = Sim3::new(a.t_i_j.pose.rotation, a.t_i_j.pose.translation, unit * exp(told));
+            PairAlignment { i: a.i, j: a.j, t_i_j: SimWithCovariance { sim, covariance: of_alignment } }
+        });
+        self.in_unit(unit, alignments.collect())
+    }
+
+    /// The same world, β's unit drawn between 0.3 and 3 m; no alignment measures it.
+    pub fn with_unmeasured_scale(&self, seed: u64) -> SimWorld<PoseWithCovariance> {
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+        let unit = exp(uniform(rng, log(0.3), log(3.0)));
+        self.in_unit(unit, self.alignments.clone())
+    }
+
+    /// β in a unit of `unit` metres.
+    fn in_unit<T>(&self, unit: f64, alignments: Vec<PairAlignment<T>>) -> SimWorld<T> {
         let mut beta = Trajectory::default();
         let mut previous = Se3::identity();
         for k in 0..self.beta.len() {
@@ -133,19 +165,13 @@ impl World {
             beta.push(PoseWithCovariance { pose, covariance: covariance(sigmas) });
             previous = anchor;
         }
-        let [m, r] = ALIGNMENT_SIGMAS;
-        let of_alignment = covariance_of([m / unit, m / unit, m / unit, r, r, r, 0.03]);
-        let alignments = self.alignments.iter().zip(&self.real).map(|(a, &real)| {
-            let told = if real { 0.03 * normal(rng) } else { uniform(rng, -1.0, 1.0) };
-            let sim = Sim3::new(a.t_i_j.pose.rotation, a.t_i_j.pose.translation, unit * libm::exp(told));
-            PairAlignment { i: a.i, j: a.j, t_i_j: SimWithCovariance { sim, covariance: of_alignment } }
-        });
         let truth = self.t_alpha_beta;
         SimWorld {
             alpha: self.alpha.clone(),
-            alignments: alignments.collect(),
             beta,
+            alignments,
             t_alpha_beta: Sim3::new(truth.rotation, truth.translation, unit),
+            beta_centre: self.beta_centre / unit,
         }
     }
 }
@@ -196,7 +222,7 @@ fn uniform(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
 /// Standard normal (Box–Muller).
 fn normal(rng: &mut ChaCha8Rng) -> f64 {
     let (u, v) = (1.0 - rng.random::<f64>(), rng.random::<f64>());
-    libm::sqrt(-2.0 * libm::log(u)) * cos(2.0 * PI * v)
+    libm::sqrt(-2.0 * log(u)) * cos(2.0 * PI * v)
 }
 
 fn normals<const N: usize>(rng: &mut ChaCha8Rng) -> SVector<f64, N> {
