@@ -12,6 +12,14 @@ copy=$CARGO_TARGET_DIR/mutant-source
 mkdir -p "$copy"
 missed=0
 
+# Mutants are built often and run briefly: our own crates are optimised less.
+build() {
+    cargo build --release --quiet -p merganser-sim \
+        --config 'profile.release.package.merganser-protocol.opt-level=1' \
+        --config 'profile.release.package.merganser-store.opt-level=1' \
+        --config 'profile.release.package.merganser-sim.opt-level=1'
+}
+
 if [ $# -eq 0 ]; then
     for patch in "$root"/sim/mutations/*.patch; do
         set -- "$@" "$(basename "$patch" .patch)"
@@ -23,7 +31,7 @@ for name in "$@"; do
     git -C "$root" archive HEAD | tar -x -C "$copy/tree"
     # The copy lies outside any repository, so the patch is applied to plain files.
     (cd "$copy/tree" && patch -p1 -s --fuzz=3 <"$root/sim/mutations/$name.patch")
-    if ! (cd "$copy/tree" && cargo build --release --quiet -p merganser-sim) 2>"$copy/log"; then
+    if ! (cd "$copy/tree" && build) 2>"$copy/log"; then
         echo "$name: the patch no longer compiles; mend it:"
         cat "$copy/log"
         missed=1

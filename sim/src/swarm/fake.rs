@@ -27,6 +27,8 @@ pub enum Bug {
     Unseeded,
     /// Asks for a timeout that is always due.
     NeverRests,
+    /// Trips over its second keyframe.
+    Panics,
 }
 
 thread_local! {
@@ -95,6 +97,7 @@ impl Core for Fake {
     fn handle(&mut self, now: Instant, input: Input) {
         match input {
             Input::Keyframe(keyframe) => {
+                assert!(bug() != Bug::Panics || self.next == 0, "planted");
                 let id = EntryId { frame: self.frame, seq: self.next };
                 self.next += 1;
                 let mut body = keyframe.stamp.0.to_le_bytes().repeat(4);

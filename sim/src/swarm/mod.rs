@@ -4,7 +4,7 @@
 
 mod act;
 #[cfg(test)]
-mod fake;
+pub(crate) mod fake;
 mod fate;
 mod hostile;
 mod look;

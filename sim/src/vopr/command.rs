@@ -26,6 +26,9 @@ pub struct VoprArgs {
     /// Run a band of seeds, FIRST..END (without END)
     #[arg(long, value_name = "FIRST..END", value_parser = parse_band)]
     pub seeds: Option<Band>,
+    /// So many robots, instead of the 2 to 10 that a seed draws
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(2..=1000))]
+    pub robots: Option<u16>,
     /// Seeds run at once; all processors if absent
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     pub jobs: Option<u16>,
@@ -52,10 +55,12 @@ pub fn run(args: &VoprArgs) -> anyhow::Result<bool> {
         (None, Some(band)) => band,
         (None, None) => anyhow::bail!("give --seed or --seeds"),
     };
+    let robots = args.robots.map(usize::from);
     if let Some(seed) = args.seed {
-        let options = toml::to_string(&draw(seed))?;
+        let options = toml::to_string(&draw(seed, robots))?;
         say(&format!("# seed {seed} — every option of this run, drawn from it:\n{options}"))?;
     }
+    let robots_given = args.robots.map_or_else(String::new, |robots| format!(" --robots {robots}"));
     let began = Instant::now();
     let reports = run_band(band, args)?;
     let wall = began.elapsed().as_secs_f64();
@@ -63,7 +68,7 @@ pub fn run(args: &VoprArgs) -> anyhow::Result<bool> {
     reports.values().for_each(|report| tally.add(report));
     for (seed, violation) in &tally.broken {
         say(&format!(
-            "BROKEN   seed {seed}, at {:.3} s: {}\n         {}\nREPLAY   merganser-sim vopr --seed {seed}",
+            "BROKEN   seed {seed}, at {:.3} s: {}\n         {}\nREPLAY   merganser-sim vopr --seed {seed}{robots_given}",
             violation.at_secs, violation.invariant, violation.what
         ))?;
     }
@@ -102,7 +107,7 @@ fn run_band(band: Band, args: &VoprArgs) -> anyhow::Result<BTreeMap<u64, SeedRep
                         return;
                     }
                     let twice = args.twice || seed.is_multiple_of(TWICE_EVERY);
-                    let report = run_seed(seed, twice);
+                    let report = run_seed(seed, args.robots.map(usize::from), twice);
                     broken.fetch_or(report.violation.is_some(), Ordering::Relaxed);
                     reports.lock().unwrap_or_else(PoisonError::into_inner).insert(seed, report);
                     bar.inc(1);

@@ -15,10 +15,11 @@ const SOLVE_SHARE: f64 = 0.15;
 /// Faults begin after this, s: robots boot first.
 const CALM_SECS: f64 = 2.0;
 
-/// The run that a seed stands for.
-pub fn draw(seed: u64) -> Scenario {
+/// The run that a seed stands for; of so many robots, if that is given, else of 2 to 10.
+pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
     let mut dice = Dice::new(seed, "vopr");
-    let robots = 2 + dice.bits() as usize % 9;
+    let drawn = 2 + dice.bits() as usize % 9;
+    let robots = robots.unwrap_or(drawn);
     let duration_secs = dice.range(25.0, 70.0);
     let solve = dice.chance(SOLVE_SHARE);
     let mut scenario = Scenario {
@@ -306,19 +307,19 @@ mod tests {
     #[test]
     fn every_seed_draws_a_good_scenario_and_always_the_same() {
         for seed in 0..500 {
-            let text = toml::to_string(&draw(seed)).unwrap();
+            let text = toml::to_string(&draw(seed, None)).unwrap();
             let read = Scenario::parse(&text).unwrap_or_else(|error| panic!("seed {seed}: {error}\n{text}"));
-            assert_eq!(read, draw(seed), "seed {seed}: what is printed is what is run");
+            assert_eq!(read, draw(seed, None), "seed {seed}: what is printed is what is run");
         }
     }
 
     #[test]
     fn every_fault_is_drawn_by_some_seed() {
         let drawn: std::collections::BTreeSet<String> = (0..500)
-            .flat_map(|seed| draw(seed).faults)
+            .flat_map(|seed| draw(seed, None).faults)
             .map(|fault| format!("{fault:?}").split(' ').next().unwrap().to_owned())
             .collect();
         assert_eq!(drawn.len(), 20, "{drawn:?}");
-        assert!((0..100).any(|seed| !draw(seed).summary.unwrap().liars.is_empty()));
+        assert!((0..100).any(|seed| !draw(seed, None).summary.unwrap().liars.is_empty()));
     }
 }

@@ -30,15 +30,15 @@ pub struct SeedReport {
     pub faults: FaultCounts,
 }
 
-/// Runs one seed; `twice` also checks that a second run leaves the same trace.
-pub fn run_seed(seed: u64, twice: bool) -> SeedReport {
-    run_with::<Agent>(seed, twice)
+/// Runs one seed, with so many robots if that is given; `twice` also checks that a second run leaves the same trace.
+pub fn run_seed(seed: u64, robots: Option<usize>, twice: bool) -> SeedReport {
+    run_with::<Agent>(seed, robots, twice)
 }
 
-fn run_with<C: Core>(seed: u64, twice: bool) -> SeedReport {
-    let mut report = one::<C>(seed);
+fn run_with<C: Core>(seed: u64, robots: Option<usize>, twice: bool) -> SeedReport {
+    let mut report = one::<C>(seed, robots);
     if twice && report.violation.is_none() {
-        let again = one::<C>(seed);
+        let again = one::<C>(seed, robots);
         if again.trace != report.trace {
             let what = format!("a second run left the trace {}, not {}", again.trace, report.trace);
             let invariant = "same seed, same trace".to_owned();
@@ -48,8 +48,8 @@ fn run_with<C: Core>(seed: u64, twice: bool) -> SeedReport {
     report
 }
 
-fn one<C: Core>(seed: u64) -> SeedReport {
-    let scenario = draw(seed);
+fn one<C: Core>(seed: u64, robots: Option<usize>) -> SeedReport {
+    let scenario = draw(seed, robots);
     let storm = scenario.duration_secs + scenario.machine.start_within_secs;
     let robots = scenario.robots;
     let broken = |invariant: &str, what: String| SeedReport {
@@ -128,5 +128,42 @@ impl Tally {
             text += &format!("{:<20} {times:>12} {runs:>8}\n", name.replace('_', " "));
         }
         text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::swarm::fake::{Bug, Fake, with_bug};
+
+    /// Seeds that an honest stand-in survives: it knows nothing of forks, so not all of them.
+    fn survived() -> Vec<u64> {
+        (0..40).filter(|seed| run_with::<Fake>(*seed, None, true).violation.is_none()).collect()
+    }
+
+    #[test]
+    fn what_is_not_drawn_from_the_seed_and_what_panics_is_found() {
+        let seeds = survived();
+        assert!(seeds.len() > 5, "{seeds:?}");
+        let broken = |bug| {
+            let run = || seeds.iter().find_map(|seed| run_with::<Fake>(*seed, None, true).violation);
+            with_bug(bug, run).map(|violation| violation.invariant)
+        };
+        assert_eq!(broken(Bug::Unseeded).as_deref(), Some("same seed, same trace"));
+        assert_eq!(broken(Bug::Panics).as_deref(), Some("no panic"));
+        assert_eq!(broken(Bug::None), None);
+    }
+
+    #[test]
+    fn a_tally_adds_up() {
+        let mut tally = Tally::default();
+        let mut report = run_with::<Fake>(survived()[0], None, false);
+        tally.add(&report);
+        report.violation = Some(Violation { invariant: "x".into(), at_secs: 1.0, what: "y".into() });
+        report.settled_secs = 1e3;
+        tally.add(&report);
+        assert_eq!((tally.seeds, tally.broken.len(), tally.slowest), (2, 1, (1e3, report.seed)));
+        assert!(tally.fired.values().all(|(times, runs)| times % 2 == 0 && runs % 2 == 0));
+        assert_eq!(tally.table().lines().count(), tally.fired.len() + 1);
     }
 }
