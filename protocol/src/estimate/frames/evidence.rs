@@ -18,7 +18,7 @@ use libm::{exp, log};
 use std::collections::BTreeMap;
 
 /// Scales reach at least this far: the tails of what is propagated to first order are longer than Gaussian.
-const SCALE_MAX_LEAST: f64 = 1.5;
+const SCALE_MAX_LEAST: f64 = 2.0;
 
 /// Evidence of sets, each solved once.
 pub(super) struct Evidence<'a, const N: usize, G> {
