@@ -15,7 +15,7 @@ use merganser_protocol::wire::limits::BLOB_PIECE_LEN;
 use merganser_protocol::wire::messages::Message;
 use std::time::Duration;
 
-fn drain(agent: &mut merganser_protocol::agent::Agent) -> Vec<Output> {
+fn drain(agent: &mut Agent) -> Vec<Output> {
     std::iter::from_fn(|| agent.poll_output()).collect()
 }
 
@@ -182,7 +182,7 @@ fn a_slow_disk_bounds_what_waits_for_it_and_nothing_is_lost() {
         .map(|_| Message::Facts(vec![EntryBytes(theirs.append(&key, 1, &verdict).unwrap().encode())]).encode())
         .collect();
     let mut batches = Vec::new();
-    let mut hear = |agent: &mut merganser_protocol::agent::Agent, bytes: &Vec<u8>| {
+    let mut hear = |agent: &mut Agent, bytes: &Vec<u8>| {
         let input = Input::Received { from: robot(1), channel: Channel::Facts, bytes: bytes.clone() };
         agent.handle(Instant::ZERO, input);
         batches.extend(drain(agent).iter().filter_map(|output| match output {
@@ -331,7 +331,6 @@ fn the_same_inputs_give_the_same_outputs() {
 fn the_roster_must_hold_the_robot_itself() {
     let mut identity = common::identity(0);
     identity.roster.remove(&name(0));
-    let result =
-        merganser_protocol::agent::Agent::new(common::config(), identity, 0, Restored::default(), Instant::ZERO);
+    let result = Agent::new(common::config(), identity, 0, Restored::default(), Instant::ZERO);
     assert!(result.is_err());
 }

@@ -27,7 +27,7 @@ fn own_facts_are_chained_and_shown_only_once_durable() {
         (
             replica.count(),
             replica.facts().count(),
-            replica.delta_for(&have_of(&replica, &testing::replica()), 65_536).entries.len(),
+            replica.delta_for(&have_of(replica, &testing::replica()), 65_536).entries.len(),
         )
     };
     assert_eq!((view(&replica), shown(&replica)), (empty.clone(), (0, 0, 0)));
