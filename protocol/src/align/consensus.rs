@@ -235,8 +235,11 @@ impl<'a> Search<'a> {
             if other.is_some() {
                 return other;
             }
-            let scale = best.fit.motion.scale;
-            scales = (scales.0.max(scale / RIVAL_SCALE), scales.1.min(scale * RIVAL_SCALE));
+            // A small prefix is searched at every scale again: that costs little, and noise there may hide one.
+            if stage.prefix > PREFIXES[1][0] {
+                let scale = best.fit.motion.scale;
+                scales = (scales.0.max(scale / RIVAL_SCALE), scales.1.min(scale * RIVAL_SCALE));
+            }
         }
         let prefix = enough.max(stage.prefix).min(largest(self.context.with_scale));
         self.step(&pool, Stage { prefix, level: stage.level }, scales, bar, Some(&taken))

@@ -59,9 +59,10 @@ pub struct Problem<'a> {
     pub target: &'a [[f64; 3]],
     /// How trustworthy each match is, higher is better; only their order matters. Good matches are tried first.
     pub scores: Option<&'a [f64]>,
-    /// Covariance of each source point, in the source frame; without it, the sources count as exact.
+    /// Covariance of each source point, in the source frame. Of the sides, one that states none counts as exact; if neither
+    /// does, all matches count as alike.
     pub source_covariances: Option<&'a [Covariance<3>]>,
-    /// Covariance of each target point, in the target frame; without it and the former, all noise is alike.
+    /// Covariance of each target point, in the target frame.
     pub target_covariances: Option<&'a [Covariance<3>]>,
 }
 

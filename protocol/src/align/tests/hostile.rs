@@ -135,7 +135,7 @@ fn coordinate() -> impl Strategy<Value = f64> {
     ]
 }
 
-fn points(n: usize) -> impl Strategy<Value = Vec<[f64; 3]>> {
+pub(super) fn points(n: usize) -> impl Strategy<Value = Vec<[f64; 3]>> {
     prop::collection::vec([coordinate(), coordinate(), coordinate()], n)
 }
 

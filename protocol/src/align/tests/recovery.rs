@@ -178,6 +178,21 @@ fn two_equal_structures_are_ambiguous_and_a_minor_one_is_not() {
     }
 }
 
+#[test]
+fn equal_rivals_of_any_scale_are_ambiguous() {
+    let model = Model::Similarity { scale_min: 0.4, scale_max: 2.5 };
+    for seed in 0..20 {
+        for (n, each, scale) in [(100, 30, 1.0), (100, 30, 0.6), (1000, 50, 1.0), (1000, 50, 1.8), (1000, 400, 1.1)] {
+            let mut case = aliased(seed, n, each, each);
+            for q in &mut case.target[each..2 * each] {
+                *q = q.map(|x| x * scale);
+            }
+            let answer = case.solve(&SolverConfig { model, ..config(3.0 * SIGMA) });
+            assert!(matches!(answer, Err(Refusal::Ambiguous { .. })), "seed {seed}, {n}, scale {scale}: {answer:?}");
+        }
+    }
+}
+
 /// `minor` of the outliers follow a second motion.
 fn aliased(seed: u64, n: usize, major: usize, minor: usize) -> Case {
     let mut case = Case::uniform(seed, n, major, 1.0);

@@ -1,9 +1,11 @@
 //! Covariances of the points' own: they sharpen the estimate, stay calibrated, and are checked.
 
+use super::hostile::points;
 use super::{Case, Draw, config};
 use crate::align::{AlignError, Alignment, CONDITION_MAX, Model, Problem, Refusal, SolverConfig, align};
 use crate::geometry::{Covariance, CovarianceError, Relative, So3};
 use nalgebra::{Matrix3, Vector3};
+use proptest::prelude::*;
 
 /// Standard deviations of a stereo camera's points: good across, ten times worse along the ray.
 const ACROSS: f64 = 0.003;
@@ -252,4 +254,53 @@ fn bad_covariances_are_errors() {
     assert!(matches!(call(&needle(1e-16)), Err(AlignError::CovarianceRange { side: "target", .. })));
     assert!(matches!(call(&needle(0.999 / CONDITION_MAX)), Err(AlignError::CovarianceRange { .. })));
     assert_eq!(call(&needle(1.001 / CONDITION_MAX)), Ok(()));
+}
+
+/// Needles, discs and balls of any size and direction.
+fn shapes(n: usize) -> impl Strategy<Value = Vec<Covariance<3>>> {
+    let sigma = prop::sample::select(vec![1e-4, 1e-2, 1.0]);
+    prop::collection::vec(([sigma.clone(), sigma.clone(), sigma], any::<u64>()), n).prop_map(|all| {
+        let one = |(sigmas, seed): ([f64; 3], u64)| {
+            let turn = Draw::new(seed).motion().rotation.matrix();
+            Covariance::from_sigmas(sigmas).expect("positive").transported(&turn).expect("a rotation")
+        };
+        all.into_iter().map(one).collect()
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
+
+    #[test]
+    fn nothing_panics_with_covariances(
+        (source, target, a, b) in (0_usize..60).prop_flat_map(|n| (points(n), points(n), shapes(n), shapes(n))),
+        truth in any::<bool>(),
+        similar in any::<bool>(),
+        sides in 0..3,
+        sigma_max in prop::sample::select(vec![1e-9, 1e-3, 1.0, 1e3, 1e9]),
+        size in prop::sample::select(vec![1e-5, 1.0, 1e5]),
+    ) {
+        let target = if truth { source.clone() } else { target };
+        let (a, b): (Vec<_>, Vec<_>) = a.iter().zip(&b).map(|(a, b)| (a.scaled(size), b.scaled(size))).unzip();
+        let problem = Problem {
+            source: &source,
+            target: &target,
+            source_covariances: (sides != 0).then_some(&a),
+            target_covariances: (sides != 1).then_some(&b),
+            ..Problem::default()
+        };
+        let model = if similar { Model::Similarity { scale_min: 1e-6, scale_max: 1e6 } } else { Model::Rigid };
+        let settings = SolverConfig { model, support_min: 4.0, ..config(sigma_max) };
+        let answer = match align(&problem, &settings) {
+            Err(AlignError::CovarianceRange { .. }) => return Ok(()),
+            other => other.expect("well-formed"),
+        };
+        if let Ok(found) = answer {
+            prop_assert!(found.sigma.is_finite() && found.log10_nfa.is_finite());
+            prop_assert!(found.inlier_probabilities.iter().all(|p| (0.0..=1.0).contains(p)), "{found:?}");
+            prop_assert!(found.information_eigenvalues.iter().all(|x| x.is_finite() && *x > 0.0));
+            let sim = found.t_target_source.sim();
+            prop_assert!(sim.translation.iter().all(|x| x.is_finite()) && sim.scale > 0.0);
+        }
+    }
 }
