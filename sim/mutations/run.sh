@@ -28,7 +28,7 @@ fi
 for name in "$@"; do
     rm -rf "${copy:?}/tree"
     mkdir "$copy/tree"
-    git -C "$root" archive HEAD | tar -x -C "$copy/tree"
+    git -C "$root" archive HEAD | tar -x -m -C "$copy/tree" # files of today: what the last mutant built is not fresh
     # The copy lies outside any repository, so the patch is applied to plain files.
     (cd "$copy/tree" && patch -p1 -s --fuzz=3 <"$root/sim/mutations/$name.patch")
     if ! (cd "$copy/tree" && build) 2>"$copy/log"; then

@@ -5,6 +5,7 @@
 use super::{Check, Seen};
 use merganser_protocol::agent::io::{Output, Record};
 use merganser_protocol::ids::{Hash, RobotId};
+use merganser_protocol::wire::Entry;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Messages remembered per robot, to be held against records that come later.
@@ -45,6 +46,10 @@ impl Check for DurableFirst {
             Seen::Wiped => state.durable.clear(),
             Seen::MayFork(origin) => {
                 self.doubted.insert(*origin);
+                let of_others =
+                    |bytes: &Vec<u8>| Entry::decode(bytes).ok().is_none_or(|e| e.id().frame.robot != *origin);
+                let waiting = self.robots.values_mut().flat_map(|robot| &mut robot.waiting);
+                waiting.for_each(|(_, needles)| needles.retain(of_others));
             }
             Seen::Durable(batch) => {
                 while state.waiting.front().is_some_and(|(number, _)| number <= batch) {
@@ -103,8 +108,9 @@ fn contains(haystack: &[u8], needle: &[u8]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use merganser_protocol::agent::io::Channel;
-    use merganser_protocol::ids::Hash;
+    use merganser_protocol::agent::io::{AskToken, Channel};
+    use merganser_protocol::ids::{EntryId, FrameId};
+    use merganser_protocol::wire::{EntryContent, SwarmTag};
 
     fn persist() -> Output {
         let bytes: Vec<u8> = (0..40).collect();
@@ -128,6 +134,26 @@ mod tests {
         let mut check = DurableFirst::default();
         assert!(check.see(0, &Seen::Output(&publish())).is_ok());
         assert!(check.see(0, &Seen::Output(&persist())).is_err());
+    }
+
+    #[test]
+    fn the_proof_of_a_fork_may_travel_before_it_is_stored() {
+        let key = ed25519_dalek::SigningKey::from_bytes(&[7; 32]);
+        let origin = RobotId::of_key(key.verifying_key().as_bytes());
+        let id = EntryId { frame: FrameId { robot: origin, epoch: 1 }, seq: 0 };
+        let (swarm, previous) = (SwarmTag([1; 8]), Hash::default());
+        let content = EntryContent { swarm, id, kind: 9, floor: 0, previous, payload: vec![3; 40] };
+        let bytes = Entry::sign(&key, content).unwrap().encode();
+        let persist = Output::Persist { batch: 1, records: vec![Record::Entry { id, bytes: bytes.clone() }] };
+        let answer = Output::Answer { token: AskToken(1), bytes };
+        for doubted in [None, Some(RobotId([1; 8])), Some(origin)] {
+            let mut check = DurableFirst::default();
+            check.see(0, &Seen::Output(&persist)).unwrap();
+            if let Some(doubted) = doubted {
+                check.see(1, &Seen::MayFork(doubted)).unwrap();
+            }
+            assert_eq!(check.see(0, &Seen::Output(&answer)).is_ok(), doubted == Some(origin), "{doubted:?}");
+        }
     }
 
     #[test]

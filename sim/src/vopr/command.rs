@@ -3,6 +3,7 @@
 use super::{SETTLE_SECS, SeedReport, Tally, draw, run_seed};
 use crate::band::{Band, parse_band};
 use crate::bar::progress_bar;
+use crate::check::Violation;
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
@@ -60,18 +61,11 @@ pub fn run(args: &VoprArgs) -> anyhow::Result<bool> {
         let options = toml::to_string(&draw(seed, robots))?;
         say(&format!("# seed {seed} — every option of this run, drawn from it:\n{options}"))?;
     }
-    let robots_given = args.robots.map_or_else(String::new, |robots| format!(" --robots {robots}"));
     let began = Instant::now();
     let reports = run_band(band, args)?;
     let wall = began.elapsed().as_secs_f64();
     let mut tally = Tally::default();
     reports.values().for_each(|report| tally.add(report));
-    for (seed, violation) in &tally.broken {
-        say(&format!(
-            "BROKEN   seed {seed}, at {:.3} s: {}\n         {}\nREPLAY   merganser-sim vopr --seed {seed}{robots_given}",
-            violation.at_secs, violation.invariant, violation.what
-        ))?;
-    }
     say(&tally.table())?;
     if let [report] = &reports.values().collect::<Vec<_>>()[..] {
         say(&one_line(report))?;
@@ -108,7 +102,11 @@ fn run_band(band: Band, args: &VoprArgs) -> anyhow::Result<BTreeMap<u64, SeedRep
                     }
                     let twice = args.twice || seed.is_multiple_of(TWICE_EVERY);
                     let report = run_seed(seed, args.robots.map(usize::from), twice);
-                    broken.fetch_or(report.violation.is_some(), Ordering::Relaxed);
+                    if let Some(text) = broken_text(&report, args) {
+                        broken.store(true, Ordering::Relaxed);
+                        // Told at once: a long band may be ended before its time.
+                        bar.suspend(|| say(&text)).unwrap_or_default();
+                    }
                     reports.lock().unwrap_or_else(PoisonError::into_inner).insert(seed, report);
                     bar.inc(1);
                 }
@@ -117,6 +115,17 @@ fn run_band(band: Band, args: &VoprArgs) -> anyhow::Result<BTreeMap<u64, SeedRep
     });
     bar.finish_and_clear();
     Ok(reports.into_inner().unwrap_or_else(PoisonError::into_inner))
+}
+
+/// What broke, if anything, and how to see it again.
+fn broken_text(report: &SeedReport, args: &VoprArgs) -> Option<String> {
+    let Violation { invariant, at_secs, what } = report.violation.as_ref()?;
+    let robots = args.robots.map_or_else(String::new, |robots| format!(" --robots {robots}"));
+    let seed = report.seed;
+    Some(format!(
+        "BROKEN   seed {seed}, at {at_secs:.3} s: {invariant}\n         {what}\nREPLAY   merganser-sim vopr --seed \
+         {seed}{robots}"
+    ))
 }
 
 fn one_line(report: &SeedReport) -> String {
