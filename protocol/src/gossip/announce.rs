@@ -36,7 +36,7 @@ impl Announce {
         let pause_max = Duration::from_secs_f64(have_secs);
         let pause = PAUSE_MIN.min(pause_max);
         Self {
-            next: now,
+            next: now.after(pause),
             pause,
             pause_max,
             agreeing: 0,
