@@ -123,6 +123,7 @@ impl<C: Core> Swarm<C> {
             Committed::Durable(up_to, healed) => {
                 self.counts.disk_healed += u64::from(healed);
                 self.see(robot, &Seen::Durable(up_to));
+                self.robots[robot].is_durable(up_to);
                 self.feed(now, robot, Input::Persisted { up_to });
             }
             Committed::Refused(batch, reason, news, pause) => {
@@ -239,6 +240,7 @@ impl<C: Core> Swarm<C> {
         let incarnation = self.robots[robot].incarnation;
         match output {
             Output::Persist { batch, records } => {
+                self.robots[robot].hands_over(batch, &records);
                 let store = &mut self.robots[robot].store;
                 store.accept(batch, records);
                 // What comes while a commit is on its way shares it.

@@ -1,6 +1,6 @@
 //! What befalls robots: processes that start and die, disks that fail, clocks that jump, and the healing of it all.
 
-use super::robot::Robot;
+use super::robot::{NewFrame, Robot};
 use super::{Event, Swarm, SwarmError, secs};
 use crate::check::Seen;
 use crate::core::Core;
@@ -57,8 +57,16 @@ impl<C: Core> Swarm<C> {
         self.see(index, &Seen::Started);
         self.counts.restarted += u64::from(incarnation > 1);
         self.drain(now, index);
+        self.tell_of_new_frame(now, index);
         self.update_hearing(now);
         Ok(())
+    }
+
+    fn tell_of_new_frame(&mut self, now: Instant, robot: usize) {
+        if self.robots[robot].core.is_some() && self.robots[robot].new_frame.is_some() {
+            self.robots[robot].new_frame = Some(NewFrame::Owed);
+            self.feed(now, robot, Input::Command(Command::NewEpoch));
+        }
     }
 
     pub(super) fn kill(&mut self, now: Instant, index: usize) {
@@ -80,6 +88,7 @@ impl<C: Core> Swarm<C> {
         let runs = robot.core.is_some();
         robot.forget(now);
         let seed = Dice::new(self.seed, &format!("cut {index} {}", now.as_nanos())).bits();
+        let lied = robot.store.disk().with_faults(|faults| faults.lies);
         let (records, cut) = robot.store.cut(seed);
         self.counts.records_lost += records as u64;
         self.counts.power_cuts += 1;
@@ -88,6 +97,9 @@ impl<C: Core> Swarm<C> {
         self.trace.note(now, index, "power cut");
         if runs {
             self.see(index, &Seen::Died);
+        }
+        if lied {
+            self.lost_what_it_confirmed(index);
         }
         self.update_hearing(now);
     }
@@ -134,7 +146,8 @@ impl<C: Core> Swarm<C> {
             Fault::NewFrame { .. } => {
                 self.robots[robot].slam.restart();
                 self.counts.new_frames += 1;
-                self.feed(now, robot, Input::Command(Command::NewEpoch));
+                self.robots[robot].new_frame = Some(NewFrame::Owed);
+                self.tell_of_new_frame(now, robot);
             }
             Fault::ClockJump { secs, .. } => {
                 self.robots[robot].slam.jump(*secs, now);
@@ -173,8 +186,7 @@ impl<C: Core> Swarm<C> {
             Fault::LyingDisk { .. } => {
                 self.trust_disk(robot);
                 self.cut(now, robot);
-                self.doubt(robot);
-                self.see(robot, &Seen::Damaged);
+                self.lost_what_it_confirmed(robot);
                 self.boot(now, robot)?;
             }
             Fault::OldImage { .. } => {
@@ -182,8 +194,7 @@ impl<C: Core> Swarm<C> {
                     self.kill(now, robot);
                     self.robots[robot].store.restore(&image);
                     self.counts.old_images += 1;
-                    self.doubt(robot);
-                    self.see(robot, &Seen::Damaged);
+                    self.lost_what_it_confirmed(robot);
                     self.boot(now, robot)?;
                 }
             }
@@ -229,6 +240,10 @@ impl<C: Core> Swarm<C> {
         let mut dice = Dice::new(self.seed, &format!("flips {robot} {}", now.as_nanos()));
         let flipped = (0..bits).filter(|_| self.robots[robot].store.disk().flip(dice.bits())).count();
         self.counts.bits_flipped += flipped as u64;
+        self.lost_what_it_confirmed(robot);
+    }
+
+    fn lost_what_it_confirmed(&mut self, robot: usize) {
         self.doubt(robot);
         self.see(robot, &Seen::Damaged);
     }

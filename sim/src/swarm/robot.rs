@@ -6,7 +6,7 @@ use crate::stage::Stage;
 use crate::world::drive::Step;
 use ed25519_dalek::SigningKey;
 use merganser_protocol::agent::Identity;
-use merganser_protocol::agent::io::QueryId;
+use merganser_protocol::agent::io::{QueryId, Record};
 use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3};
 use merganser_protocol::ids::{Name, NameError, RobotId};
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
@@ -48,6 +48,8 @@ pub(super) struct Robot<C> {
     /// Speaks another version.
     pub other_version: bool,
     pub slam: Slam,
+    /// SLAM began a new frame, and the agent has not closed the old one on disk.
+    pub new_frame: Option<NewFrame>,
     pub questions: BTreeSet<QueryId>,
     pub asked: BTreeMap<u64, Asked>,
     pub tokens: u64,
@@ -56,6 +58,15 @@ pub(super) struct Robot<C> {
     pub hears: Vec<Hearing>,
     pub usage: BTreeMap<&'static str, Usage>,
     pub keyframes: u64,
+}
+
+/// How far the agent is told of SLAM's new frame. Whoever supervises a robot tells it anew until it is on disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum NewFrame {
+    /// The agent must be told, or will answer.
+    Owed,
+    /// The old frame is closed with this batch.
+    Closing(u64),
 }
 
 /// A peer's question that waits for our answer.
@@ -105,6 +116,7 @@ impl<C> Robot<C> {
             equivocates: false,
             other_version: false,
             slam,
+            new_frame: None,
             questions: BTreeSet::new(),
             asked: BTreeMap::new(),
             tokens: 0,
@@ -156,6 +168,19 @@ impl<C> Robot<C> {
             }
             None => done(&now),
         }
+    }
+
+    /// A batch was handed to the disk.
+    pub fn hands_over(&mut self, batch: u64, records: &[Record]) {
+        let closes = records.iter().any(|record| matches!(record, Record::EpochClosed { .. }));
+        if closes && self.new_frame.is_some() {
+            self.new_frame = Some(NewFrame::Closing(batch));
+        }
+    }
+
+    /// All batches up to `up_to` are on disk.
+    pub fn is_durable(&mut self, up_to: u64) {
+        self.new_frame = self.new_frame.filter(|told| !matches!(told, NewFrame::Closing(batch) if *batch <= up_to));
     }
 
     pub fn count(&mut self, kind: &'static str, bytes: usize) {
