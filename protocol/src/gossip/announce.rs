@@ -104,6 +104,11 @@ impl Announce {
         (self.hearers as f64 / FEW).max(1.0)
     }
 
+    /// See [`Purse::refill`].
+    pub fn refill(&mut self, now: Instant) {
+        self.purse.refill(now);
+    }
+
     fn restart(&mut self, at: Instant) {
         self.next = self.next.min(at);
         self.pause = PAUSE_MIN.min(self.pause_max);

@@ -4,7 +4,8 @@
 //! - **Announce** the root hash: 18 bytes or so. While nothing changes, the pauses double and a robot that has heard
 //!   enough equal roots stays silent (Trickle, RFC 6206). News are announced the sooner the more of them there are.
 //! - **Pull**: a neighbour with another root is asked for what we lack, by have-vector; one question at a time, to the
-//!   neighbour that promises most, so that nothing is fetched twice. Small gains wait for more, large ones do not.
+//!   neighbour that promises most, so that nothing is fetched twice. Small gains wait for more, large ones do not, nor
+//!   what follows a large one: after a partition the last few facts are as welcome as the first many.
 //! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
 //! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
 //!   pause that doubles until either side changes.
@@ -31,6 +32,8 @@ use std::collections::BTreeMap;
 const QUESTIONS_PER_SEC: f64 = 0.8;
 /// ...and how many of them may follow a pause at once.
 const QUESTIONS_AT_ONCE: f64 = 6.0;
+/// New facts in one answer that show that the sets were far apart: what is left to say should follow at once.
+const FAR_APART: usize = 48;
 
 /// What to do now.
 #[derive(Clone, Debug, PartialEq)]
@@ -144,6 +147,10 @@ impl Spread {
         let Some(neighbour) = self.neighbours.get_mut(&peer) else { return };
         self.wake = now;
         neighbour.answered(now, replica.root(), answer);
+        if matches!(answer, Answer::Got { new, .. } if new >= FAR_APART) {
+            self.purse.refill(now);
+            self.announce.refill(now);
+        }
     }
 
     /// The set of durable facts grew by `new`.

@@ -19,8 +19,6 @@ const REST_MIN: Duration = Duration::from_secs(1);
 const REST_MAX: Duration = Duration::from_secs(60);
 /// Round trip assumed before the first answer.
 const ROUND_TRIP: Duration = Duration::from_millis(100);
-/// Longest round trip assumed after failures.
-const ROUND_TRIP_MAX: Duration = Duration::from_millis(300);
 /// Shortest patience with a question.
 const PATIENCE_MIN: Duration = Duration::from_millis(200);
 
@@ -158,8 +156,7 @@ impl Neighbour {
         let Some(question) = self.asked.take() else { return };
         let (new, more) = match answer {
             Answer::Failed => {
-                self.more = false; // Somebody else may do better.
-                self.round_trip = (self.round_trip * 3 / 2).min(ROUND_TRIP_MAX);
+                self.more = false; // Somebody else may do better. How long answers take, those that come tell.
                 return;
             }
             Answer::Refused => {

@@ -44,12 +44,46 @@ impl Purse {
         self.at = now;
     }
 
+    /// Much was moved at once: now the purse holds twice what fills it otherwise.
+    pub fn refill(&mut self, now: Instant) {
+        self.coins = 2.0 * self.coins_max;
+        self.at = now;
+    }
+
     fn coins_at(&self, now: Instant) -> f64 {
-        (self.coins + self.coins_per_sec * now.since(self.at).as_secs_f64()).min(self.coins_max)
+        let earned = self.coins_per_sec * now.since(self.at).as_secs_f64();
+        (self.coins + earned).min(self.coins.max(self.coins_max))
     }
 }
 
 /// A message costs a coin, and less if it moves much.
 fn price(facts: f64) -> f64 {
     (FACTS_PER_COIN / facts.max(1.0)).min(1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_follows_a_large_gain_need_not_wait() {
+        let now = Instant::ZERO;
+        let mut purse = Purse::new(1.0, 2.0, now);
+        let at_once = |purse: &mut Purse| {
+            let mut count = 0;
+            while purse.due(now, 1.0) <= now {
+                purse.pay(now, 1.0, 1.0);
+                count += 1;
+            }
+            count
+        };
+        assert_eq!(at_once(&mut purse), 2);
+        purse.refill(now);
+        assert_eq!(at_once(&mut purse), 4);
+        purse.refill(now);
+        let later = now.after(Duration::from_secs(100));
+        assert!(purse.coins_at(later) <= 4.0, "what it holds beyond its fill does not grow");
+        purse.pay(later, 1.0, 4.0);
+        assert!(purse.coins_at(later.after(Duration::from_secs(100))) <= 2.0);
+    }
 }
