@@ -22,8 +22,11 @@ const EDGES_MAX: usize = 262_144;
 /// An edge is kept if its ends have this many standard deviations more common neighbours than their degrees explain, or if
 /// they share most: where nearly all matches are true, degrees explain everything.
 const EXCESS_MIN: f32 = 1.0;
-/// Edges expanded to triangles.
-const EDGES_EXPANDED: usize = 256;
+/// Edges expanded to triangles, at most and at least. Where the ends of the best share more than [`DENSE`] of all matches,
+/// nearly all good edges are of one structure, and fewer serve.
+const EDGES_EXPANDED: [usize; 2] = [256, 24];
+/// See [`EDGES_EXPANDED`].
+const DENSE: f64 = 0.06;
 /// Triangles kept per expanded edge.
 const TRIANGLES_PER_EDGE: usize = 3;
 /// Third vertices tried per expanded edge; beyond, an even selection.
@@ -260,9 +263,13 @@ impl Sampler {
             edge.kept = Reverse(common(self.kept.row(edge.i as usize), self.kept.row(edge.j as usize)));
         }
         self.edges.retain(|e| e.kept.0 > 0);
-        if self.edges.len() > EDGES_EXPANDED {
-            self.edges.select_nth_unstable(EDGES_EXPANDED);
-            self.edges.truncate(EDGES_EXPANDED);
+        let most = self.edges.iter().map(|e| e.kept.0).max().unwrap_or(0);
+        let dense = f64::from(most) / (DENSE * self.graph.count.max(1) as f64);
+        let [high, low] = EDGES_EXPANDED;
+        let expanded = ((high as f64 / dense.max(1.0)) as usize).max(low);
+        if self.edges.len() > expanded {
+            self.edges.select_nth_unstable(expanded);
+            self.edges.truncate(expanded);
         }
     }
 
