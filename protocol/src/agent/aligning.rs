@@ -34,17 +34,36 @@ impl Agent {
         }
     }
 
-    /// Pairs a submap that became known with all that it may overlap.
+    /// Pairs a submap that became known with all that it may overlap: one of ours with all, one of another's with ours.
     fn note_candidates(&mut self, new: SubmapId) {
-        let others: Vec<SubmapId> = if new.frame.robot == self.me.robot {
-            self.knowledge.submaps().map(|(id, _)| id).collect()
-        } else {
-            self.knowledge.submaps().map(|(id, _)| id).filter(|id| id.frame.robot == self.me.robot).collect()
+        let Some(summary) = self.knowledge.submap(new).and_then(summary_of) else { return };
+        let ours = new.frame.robot == self.me.robot;
+        let limit = self.config.align.candidates_max;
+        // Asked for once, not for each of thousands of pairs.
+        let mut least = self.negotiation.least_similarity(limit);
+        let wanted = match self.negotiation.wishes.len() < limit {
+            true => self.config.align.similarity_min,
+            false => self.config.align.similarity_min.max(least),
         };
-        for other in others {
-            let (mine, theirs) = if new.frame.robot == self.me.robot { (new, other) } else { (other, new) };
-            if self.may_pair(mine, theirs) {
-                self.note_pair(mine, theirs);
+        let compare = |(id, fact): (SubmapId, &SubmapFact)| Some((id, summary.similarity(&summary_of(fact)?)));
+        let alike = |(_, similarity): &(SubmapId, f64)| *similarity >= wanted;
+        let others: Vec<(SubmapId, f64)> = match ours {
+            true => self.knowledge.submaps().filter_map(compare).filter(alike).collect(),
+            false => self.knowledge.submaps_of(self.me.robot).filter_map(compare).filter(alike).collect(),
+        };
+        for (other, similarity) in others {
+            let (mine, theirs) = if ours { (new, other) } else { (other, new) };
+            if similarity < least && self.negotiation.wishes.len() >= limit {
+                continue;
+            }
+            let pair = pair_of(mine, theirs);
+            if Negotiation::responsible(pair) == self.me.robot || mine.frame.robot == theirs.frame.robot {
+                if similarity >= least && self.may_pair(mine, theirs) {
+                    self.negotiation.add_candidate(Candidate { mine, theirs, similarity, wished: false }, limit);
+                    least = self.negotiation.least_similarity(limit);
+                }
+            } else if self.negotiation.wishes.len() < limit && self.may_pair(mine, theirs) {
+                self.negotiation.wishes.insert(pair, similarity);
             }
         }
     }
@@ -53,22 +72,6 @@ impl Agent {
         let pair = pair_of(mine, theirs);
         let far = mine.frame != theirs.frame || mine.index.abs_diff(theirs.index) >= LOOP_GAP;
         far && !self.negotiation.is_tried(pair) && !self.knowledge.is_stated(pair)
-    }
-
-    fn note_pair(&mut self, mine: SubmapId, theirs: SubmapId) {
-        let summary = |id| self.knowledge.submap(id).and_then(|fact: &SubmapFact| Summary::decode(&fact.summary).ok());
-        let (Some(a), Some(b)) = (summary(mine), summary(theirs)) else { return };
-        let similarity = a.similarity(&b);
-        if similarity < self.config.align.similarity_min {
-            return;
-        }
-        let pair = pair_of(mine, theirs);
-        let limit = self.config.align.candidates_max;
-        if Negotiation::responsible(pair) == self.me.robot || mine.frame.robot == theirs.frame.robot {
-            self.negotiation.add_candidate(Candidate { mine, theirs, similarity, wished: false }, limit);
-        } else if self.negotiation.wishes.len() < limit {
-            self.negotiation.wishes.insert(pair, similarity);
-        }
     }
 
     /// Somebody aligned one of our submaps: we owe an answer, once.
@@ -370,4 +373,8 @@ fn t_i_j(work: &Work, t_mine_theirs: &Relative) -> Relative {
 
 fn to_support(support: f64) -> u16 {
     support.clamp(0.0, f64::from(u16::MAX)) as u16
+}
+
+fn summary_of(fact: &SubmapFact) -> Option<Summary> {
+    Summary::decode(&fact.summary).ok()
 }

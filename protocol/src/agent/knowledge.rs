@@ -87,6 +87,12 @@ impl Knowledge {
         self.submaps.iter().map(|(id, (_, fact))| (*id, fact))
     }
 
+    /// The submaps of one robot, of all its frames.
+    pub fn submaps_of(&self, robot: RobotId) -> impl Iterator<Item = (SubmapId, &SubmapFact)> {
+        let end = |epoch, index| SubmapId { frame: FrameId { robot, epoch }, index };
+        self.submaps.range(end(0, 0)..=end(u32::MAX, u32::MAX)).map(|(id, (_, fact))| (*id, fact))
+    }
+
     /// One submap.
     pub fn submap(&self, id: SubmapId) -> Option<&SubmapFact> {
         self.submaps.get(&id).map(|(_, fact)| fact)

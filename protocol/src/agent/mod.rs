@@ -392,13 +392,15 @@ impl Agent {
     fn relearn(&mut self) {
         self.knowledge = Knowledge::default();
         self.negotiation.clear_candidates();
-        let facts: Vec<(EntryId, Fact)> = self.replica.facts().collect();
-        for (id, fact) in &facts {
-            self.knowledge.absorb(*id, fact.clone());
-        }
-        for (id, fact) in facts.iter().filter(|(_, fact)| !matches!(fact, Fact::Verdict(_))) {
-            self.on_fact(*id, fact); // Verdicts call for nothing but news, and these are old.
-        }
+        self.replica.facts().for_each(|(id, fact)| self.knowledge.absorb(id, fact));
+        // Verdicts call for nothing but news, and these are old; submaps of others are met by each of ours.
+        let calls = |(id, fact): &(EntryId, Fact)| match fact {
+            Fact::Submap(_) => id.frame.robot == self.me.robot,
+            Fact::Verdict(_) => false,
+            Fact::Alignment(_) | Fact::Sighting(_) => true,
+        };
+        let facts: Vec<(EntryId, Fact)> = self.replica.facts().filter(calls).collect();
+        facts.iter().for_each(|(id, fact)| self.on_fact(*id, fact));
         self.map.dirty = true;
     }
 

@@ -185,6 +185,14 @@ impl Negotiation {
         }
     }
 
+    /// A candidate less similar than this would not be kept.
+    pub fn least_similarity(&self, limit: usize) -> f64 {
+        match self.candidates.len() < limit {
+            true => f64::NEG_INFINITY,
+            false => self.candidates.values().map(|c| c.similarity).fold(f64::INFINITY, f64::min),
+        }
+    }
+
     /// The other endpoint wishes this pair tried. False if it is unknown here.
     pub fn wish(&mut self, pair: Pair) -> bool {
         match self.candidates.get_mut(&pair) {
