@@ -1,9 +1,9 @@
 //! The list of bad input, one test each: what an agent does with it is refuse, count and go on.
 
 use crate::Limit;
-use crate::fuzzing::people::{agent, key, robot, sigmas, swarm};
+use crate::fuzzing::people::{agent, described, key, robot, sigmas, swarm};
 use crate::fuzzing::{Meter, decode};
-use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, Output, QueryKind};
+use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, Output, QueryKind, Record};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::geometry::{PoseWithCovariance, Se3};
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, SubmapId};
@@ -244,4 +244,27 @@ fn a_closed_epoch_stays_closed() {
     assert_eq!((victim.0.frame().epoch, victim.0.status().entries), (3, 1));
     assert!(!stored(&victim.hear_entry(sign(0, content(0, 1, 2, Hash::of(b"more"))))));
     assert_eq!(victim.refused("quarantined"), 1);
+}
+
+#[test]
+fn a_piece_beyond_the_end_of_a_blob_is_not_to_be_had() {
+    let blob = described().0.clone();
+    let (hash, len) = (Hash::of(&blob), blob.len() as u32);
+    let records = vec![Record::Blob { hash, bytes: blob }];
+    let mut victim = Victim(agent(0, Restored { records, fresh_epoch: 1 }, Instant::ZERO));
+    let mut piece = |offset, wanted| {
+        let bytes = Message::BlobRequest { hash, offset, len: wanted }.encode();
+        let outputs = victim.give(Input::Asked { token: AskToken(1), kind: QueryKind::Blob, bytes });
+        let answer = outputs.into_iter().find_map(|output| match output {
+            Output::Answer { bytes, .. } => Some(bytes),
+            _ => None,
+        });
+        // "I cannot" is empty; all else must be readable.
+        let answer = answer.filter(|bytes| !bytes.is_empty())?;
+        let Message::BlobReply { bytes, .. } = Message::decode(&answer).unwrap() else { panic!("no piece") };
+        Some(bytes.len() as u32)
+    };
+    assert_eq!(piece(0, u32::MAX), Some(len));
+    assert_eq!((piece(len - 1, 9), piece(len, 9)), (Some(1), Some(0)));
+    assert_eq!((piece(len + 1, 9), piece(u32::MAX, u32::MAX)), (None, None));
 }
