@@ -135,10 +135,7 @@ impl Forge {
     }
 
     pub fn root(r: &mut Reader) -> Message {
-        Message::Have(HaveRoot {
-            root: [r.byte(); 8],
-            count: u64::from(r.byte()) * if r.one_in(4) { u64::MAX } else { 1 },
-        })
+        Message::Have(HaveRoot { root: [r.byte(); 8], count: r.pick(&[0, 1, 2, 3, 9, 200, u64::MAX]) })
     }
 
     /// A question of the kind asked for, or of another.
