@@ -9,7 +9,7 @@ use merganser_protocol::geometry::{PoseWithCovariance, Se3};
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, SubmapId};
 use merganser_protocol::time::{Instant, Stamp};
 use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
-use merganser_protocol::wire::{Beacon, BeaconContent, Entry, EntryBytes, EntryContent, Message, SwarmTag};
+use merganser_protocol::wire::{Beacon, BeaconContent, Entry, EntryBytes, EntryContent, HaveRoot, Message, SwarmTag};
 
 const CHANNELS: [Channel; 3] = [Channel::Pose, Channel::Facts, Channel::Have];
 const KINDS: [QueryKind; 3] = [QueryKind::Sync, QueryKind::Blob, QueryKind::Align];
@@ -267,4 +267,19 @@ fn a_piece_beyond_the_end_of_a_blob_is_not_to_be_had() {
     assert_eq!(piece(0, u32::MAX), Some(len));
     assert_eq!((piece(len - 1, 9), piece(len, 9)), (Some(1), Some(0)));
     assert_eq!((piece(len + 1, 9), piece(u32::MAX, u32::MAX)), (None, None));
+}
+
+#[test]
+fn a_clock_at_the_end_of_time_starts_no_storm() {
+    let mut victim = Victim::new();
+    victim.give(Input::Neighbour { robot: robot(1), up: true });
+    let root = HaveRoot { root: [7; 8], count: 9 };
+    let have = || Input::Received { from: robot(1), channel: Channel::Have, bytes: Message::Have(root).encode() };
+    let mut said = 0;
+    for now in [u64::MAX - 1, u64::MAX, 0].into_iter().cycle().take(300) {
+        victim.0.handle(Instant::from_nanos(now), have());
+        let outputs = std::iter::from_fn(|| victim.0.poll_output()).take(1000);
+        said += outputs.filter(|o| matches!(o, Output::Publish { .. } | Output::Ask { .. })).count();
+    }
+    assert!((1..=4).contains(&said), "{said} messages in one moment");
 }
