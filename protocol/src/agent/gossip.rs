@@ -337,9 +337,9 @@ impl Agent {
             }
             (QueryKind::Blob, Message::BlobRequest { hash, offset, len }) => {
                 let blob = self.gossip.blobs.get(&hash)?;
-                let start = (offset as usize).min(blob.len());
+                let start = offset as usize;
                 let end = start.saturating_add(len as usize).min(blob.len());
-                let bytes = blob.get(start..end)?.to_vec();
+                let bytes = blob.get(start..end)?.to_vec(); // Beyond its end there is nothing to say.
                 Some(Message::BlobReply { hash, offset, total: blob.len() as u32, bytes })
             }
             (QueryKind::Align, Message::AlignRequest { i, j }) => {

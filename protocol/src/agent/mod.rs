@@ -41,6 +41,10 @@ use thiserror::Error;
 pub use knowledge::Agreement;
 pub use negotiation::{ALIGNMENTS_PER_FRAME_PAIR, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP};
 
+/// A clock that shows more (after 292 years, or because it is broken) stands still for the agent: pauses must end after
+/// they begin, or whatever is repeated after a pause would be repeated without one.
+const LATEST: Instant = Instant::from_nanos(u64::MAX / 2);
+
 /// Who this agent is and whom it trusts.
 #[derive(Clone)]
 pub struct Identity {
@@ -141,12 +145,12 @@ impl Agent {
         let frame = FrameId { robot, epoch: restored.fresh_epoch };
         let mut agent = Self {
             mapper: Mapper::new(&config.submap),
-            gossip: Gossip::new(robot, &config.gossip, now),
+            gossip: Gossip::new(robot, &config.gossip, now.min(LATEST)),
             me: Me { robot, frame, key, name: identity.name, swarm: identity.swarm },
             rng: ChaCha8Rng::seed_from_u64(seed),
             config,
             seed,
-            now,
+            now: now.min(LATEST),
             replica,
             outputs: VecDeque::new(),
             ledger: Ledger::default(),
@@ -164,7 +168,7 @@ impl Agent {
 
     /// Takes one input.
     pub fn handle(&mut self, now: Instant, input: Input) {
-        self.now = self.now.max(now);
+        self.now = self.now.max(now.min(LATEST));
         match input {
             Input::Keyframe(keyframe) => self.on_keyframe(keyframe),
             Input::Sighting(sighting) => self.on_sighting(&sighting),
