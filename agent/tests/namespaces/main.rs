@@ -8,6 +8,7 @@
 //! cargo test --release -p merganser --test namespaces -- --ignored --test-threads=1
 //! ```
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
+#![allow(clippy::print_stdout, reason = "what a test saw is worth a line")]
 
 mod air;
 #[path = "../common/mod.rs"]
@@ -100,7 +101,7 @@ fn facts_pass_through_a_robot_in_the_middle() {
     air.block("alpha", "gamma");
     air.block("gamma", "alpha");
     let mut fleet = Fleet::drive(&air, 8.0);
-    fleet.end_alike();
+    fleet.hold_alike();
     assert!(air.dropped() > 0, "nothing was dropped");
     assert_eq!(fleet.alpha().now().neighbours(), BTreeSet::from(["beta"]));
     assert_eq!(fleet.gamma().now().neighbours(), BTreeSet::from(["beta"]));
@@ -114,10 +115,10 @@ fn a_link_that_carries_one_way_only_is_got_around() {
     let mut fleet = Fleet::drive(&air, 4.0);
     fleet.until_all("everybody hears everybody", |seen| seen.neighbours().len() == 2);
     air.block("alpha", "beta");
-    fleet.end_alike();
+    fleet.hold_alike();
     assert!(air.dropped() > 0, "nothing was dropped");
     fleet.beta().until("beta misses alpha", |seen| seen.neighbours() == BTreeSet::from(["gamma"]));
-    fleet.end_alike();
+    fleet.hold_alike();
 }
 
 #[test]

@@ -77,12 +77,21 @@ impl<'a> Fleet<'a> {
 
     /// Waits until all recordings are over, nobody has anything left to do, and all have held the same for a while.
     pub fn end_alike(&mut self) {
+        self.settle(|seen| seen.status.idle);
+    }
+
+    /// The same where not all hear each other: keypoints that nobody in reach has are looked for half a minute longer.
+    pub fn hold_alike(&mut self) {
+        self.settle(|_| true);
+    }
+
+    fn settle(&mut self, done: impl Fn(&Seen) -> bool) {
         let began = Instant::now();
         let mut held: Option<(Instant, String, u64)> = None;
         loop {
             let seen: Vec<Seen> = self.robots.iter_mut().map(Robot::now).collect();
             let first = &seen[0].status;
-            let over = |(robot, seen): (&Robot, &Seen)| seen.status.keyframes == robot.keyframes && seen.status.idle;
+            let over = |(robot, seen): (&Robot, &Seen)| seen.status.keyframes == robot.keyframes && done(seen);
             let over = self.robots.iter().zip(&seen).all(over);
             let alike = seen.iter().all(|s| (&s.status.digest, s.status.entries) == (&first.digest, first.entries));
             if !over || !alike {
