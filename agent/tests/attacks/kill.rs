@@ -24,9 +24,9 @@ const SUBMAPS: u64 = 8;
 const KEYFRAMES: u32 = 3;
 
 #[tokio::test(flavor = "multi_thread")]
-#[ignore = "about a second a loop: set MERGANSER_KILLS and run with --ignored"]
+#[ignore = "a fifth of a second a kill: set MERGANSER_KILLS and run with --ignored"]
 async fn a_robot_killed_at_any_moment_keeps_all_that_it_told() {
-    let (kills, seed) = (number("MERGANSER_KILLS", 20), number("MERGANSER_KILL_SEED", 1));
+    let (kills, seed) = (number("MERGANSER_KILLS", 60), number("MERGANSER_KILL_SEED", 1));
     println!("MERGANSER_KILLS={kills} MERGANSER_KILL_SEED={seed}");
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut draw = |below: u64| rng.next_u64() % below;
