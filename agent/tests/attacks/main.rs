@@ -1,0 +1,19 @@
+//! Attacks on the real program over real Zenoh, on loopback: it is killed at any moment, and flooded by strangers. They
+//! take longer than a plain `cargo test` should; how long is for the environment to say:
+//!
+//! ```sh
+//! MERGANSER_KILLS=500 MERGANSER_FLOOD_SECS=30 \
+//!   cargo test --release -p merganser --test attacks -- --ignored --test-threads=1 --nocapture
+//! ```
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
+
+#[path = "../common/mod.rs"]
+mod common;
+mod flood;
+mod kill;
+mod outsider;
+
+/// A number that the environment may set.
+fn number(variable: &str, default: u64) -> u64 {
+    std::env::var(variable).map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}")))
+}
