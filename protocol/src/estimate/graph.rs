@@ -8,7 +8,7 @@
 use crate::geometry::sim3::{self, Matrix7, Vector7};
 use crate::geometry::{Covariance, Relative, Se3, Sim3, se3};
 use crate::ids::{EntryId, FrameId, SubmapId};
-use nalgebra::SMatrix;
+use nalgebra::{Matrix6, SMatrix, Vector6};
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 
@@ -245,6 +245,16 @@ impl Edge {
     }
 }
 
+impl Edge {
+    /// Of a factor between anchors of fixed unit: the residual, `∂r/∂δ_j = J_r⁻¹(r)`, and `A = Ad((X_i⁻¹ X_j)⁻¹)`, with
+    /// which `∂r/∂δ_i = −J_l⁻¹(r) Ad(t_i_j⁻¹) = −J_r⁻¹(r) A`.
+    pub(super) fn linearise_rigid(&self, values: &[Sim3]) -> (Vector6<f64>, Matrix6<f64>, Matrix6<f64>) {
+        let t_i_j = (values[self.i].inverse() * values[self.j]).to_se3();
+        let residual = self.factor.t_i_j.sim().to_se3().local(&t_i_j);
+        (residual, se3::right_jacobian_inv(&residual), t_i_j.inverse().adjoint())
+    }
+}
+
 /// Both anchors lie in one unit, so that the predicted `X_i⁻¹ X_j` has scale 1 and lengths in that unit. Only the
 /// common scale matters: growing it by λ shrinks the prediction's translation by e^−λ.
 fn linearise_rigid(measured: &Se3, predicted: &Se3) -> Linearised {
@@ -266,7 +276,7 @@ fn information_of<const N: usize>(covariance: &Covariance<N>) -> SMatrix<f64, N,
 }
 
 /// A rigid tangent vector as one of SIM(3).
-pub(super) fn lift(xi: &nalgebra::Vector6<f64>) -> Vector7 {
+pub(super) fn lift(xi: &Vector6<f64>) -> Vector7 {
     let mut out = Vector7::zeros();
     out.fixed_rows_mut::<6>(0).copy_from(xi);
     out

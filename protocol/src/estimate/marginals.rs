@@ -105,7 +105,7 @@ impl Solution {
                 columns[c * n + scalar] = row[c];
             }
         }
-        self.pattern.solve(&self.factor, &mut columns, 7).ok()?;
+        self.pattern.solve(&self.factor, &mut columns);
         Some(columns)
     }
 

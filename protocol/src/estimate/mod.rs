@@ -1,12 +1,16 @@
 //! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
 
+pub mod certificate;
+pub mod chordal;
 pub mod frames;
 pub mod graph;
 mod intake;
 pub mod joint;
 mod loops;
 pub mod marginals;
+mod minimise;
 mod pairs;
+pub mod posegraph;
 pub mod residual;
 mod reweight;
 pub mod solve;

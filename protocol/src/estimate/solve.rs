@@ -1,26 +1,16 @@
 //! Levenberg–Marquardt on one component: decides the most probable anchors given its factors.
 //!
-//! Each iteration tries the undamped Gauss–Newton step first; where that fails, damping `H + μ diag(H)` follows
-//! Nielsen's rule (Madsen, Nielsen and Tingleff 2004, §3.2). The elimination order and symbolic factorisation are made
-//! once. The result depends on the graph and the start alone; the start is made from the same set of facts, never from
-//! an earlier estimate.
+//! The result depends on the graph and the start alone; the start is made from the same set of facts, never from an
+//! earlier estimate.
 
 use super::graph::{Edge, Graph};
-use super::sparse::{BlockPattern, Slot};
+use super::minimise::{Minimum, Normal, Objective, minimise};
+use super::sparse::{BlockPattern, Factor, Slot};
 use crate::geometry::Sim3;
 use crate::geometry::sim3::Vector7;
-use nalgebra::SMatrix;
+use nalgebra::{Matrix6, SMatrix};
 use std::sync::Arc;
 use thiserror::Error;
-
-/// Stop when a step promises to lower χ² by less than this share of (1 + χ²): a millionth of a standard deviation.
-const DECREASE_MIN: f64 = 1e-12;
-/// First damping after Gauss–Newton failed.
-const DAMPING_FIRST: f64 = 1e-4;
-/// Damping below this is dropped.
-const DAMPING_MIN: f64 = 1e-8;
-/// Damping above this means that no step helps.
-const DAMPING_MAX: f64 = 1e16;
 
 /// Why a component could not be solved.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
@@ -61,7 +51,7 @@ pub struct Solution {
     /// Whether the last step was negligible (otherwise the iterations ran out).
     pub converged: bool,
     pub(super) pattern: Arc<BlockPattern>,
-    pub(super) factor: Vec<f64>,
+    pub(super) factor: Factor,
 }
 
 impl Solution {
@@ -86,89 +76,14 @@ pub fn solve(graph: Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<So
         return Err(SolveError::Start { want: graph.nodes().len(), got: start.len() });
     }
     let system = System::new(&graph)?;
-    let mut state = State::at(&graph, start)?;
+    let Minimum { values, cost: chi2, iterations, converged } = minimise(&system, start, iterations_max)?;
     let mut normal = Normal::default();
-    let (mut damping, mut growth) = (0.0, 2.0);
-    let (mut iterations, mut converged) = (0, system.pattern.scalars() == 0);
-    while !converged && iterations < iterations_max {
-        iterations += 1;
-        system.linearise(&graph, &state.values, &mut normal);
-        loop {
-            let step = system.step(&normal, damping);
-            let trial =
-                step.and_then(|s| Ok((s.decrease, State::at(&graph, system.retract(&graph, &state, &s.delta))?)));
-            let threshold = DECREASE_MIN * (1.0 + state.chi2);
-            if let Ok((promised, next)) = &trial {
-                let gain = (state.chi2 - next.chi2) / promised;
-                if *promised <= threshold {
-                    converged = true;
-                }
-                if gain > 0.0 || (converged && next.chi2 <= state.chi2 + threshold) {
-                    let lean = 2.0 * gain - 1.0;
-                    damping *= (1.0 - lean * lean * lean).max(1.0 / 3.0);
-                    growth = 2.0;
-                    if damping < DAMPING_MIN {
-                        damping = if gain < 0.25 { DAMPING_FIRST } else { 0.0 };
-                    }
-                    state = next.clone();
-                    break;
-                }
-                if converged {
-                    break;
-                }
-            }
-            if damping > DAMPING_MAX {
-                // No step lowers χ²: a stationary point, unless the system itself cannot be factorised.
-                trial?;
-                converged = true;
-                break;
-            }
-            damping = if damping == 0.0 { DAMPING_FIRST } else { damping * growth };
-            growth *= 2.0;
-        }
-    }
-    system.linearise(&graph, &state.values, &mut normal);
-    let mut factor = Vec::new();
-    system.pattern.factorise(&normal.h, &mut factor)?;
+    normal.at(&system, &values);
+    let factor = system.pattern.factorise(normal.h)?;
     let residuals: usize = graph.edges().iter().map(Edge::dimension).sum();
     let dof = residuals.saturating_sub(system.pattern.scalars());
-    Ok(Solution {
-        graph,
-        values: state.values,
-        chi2: state.chi2,
-        dof,
-        iterations,
-        converged,
-        pattern: Arc::new(system.pattern),
-        factor,
-    })
-}
-
-/// A point and its χ².
-#[derive(Clone)]
-struct State {
-    values: Vec<Sim3>,
-    chi2: f64,
-}
-
-impl State {
-    fn at(graph: &Graph, values: Vec<Sim3>) -> Result<Self, SolveError> {
-        let chi2: f64 = graph.edges().iter().map(|e| e.chi2(&values)).sum();
-        if chi2.is_finite() { Ok(Self { values, chi2 }) } else { Err(SolveError::NotFinite) }
-    }
-}
-
-/// `H = Σ JᵀWJ` and `g = Σ JᵀWr`.
-#[derive(Default)]
-struct Normal {
-    h: Vec<f64>,
-    g: Vec<f64>,
-}
-
-struct Step {
-    delta: Vec<f64>,
-    /// By how much the quadratic model says that χ² falls.
-    decrease: f64,
+    let pattern = Arc::new(system.pattern);
+    Ok(Solution { graph, values, chi2, dof, iterations, converged, pattern, factor })
 }
 
 /// Which columns of a factor's Jacobians belong to a variable.
@@ -181,81 +96,70 @@ enum Part {
     ScaleBoth,
 }
 
-/// Index bookkeeping: variables of the nodes, and the blocks each factor adds to.
-struct System {
+/// A graph's χ² with its index bookkeeping: variables of the nodes, and the blocks each factor adds to.
+struct System<'a> {
+    graph: &'a Graph,
     pattern: BlockPattern,
     terms: Vec<Terms>,
 }
 
-struct Terms {
-    parts: Vec<(usize, Part)>,
-    /// Slots of the parts' pairs (p, q), p ≤ q, row by row.
-    slots: Vec<Slot>,
+enum Terms {
+    /// Between anchors of fixed unit: the slots of (i, i), (i, j) and (j, j); `None` at the anchor held fixed.
+    Rigid { i: Option<(usize, Slot)>, j: Option<(usize, Slot)>, cross: Option<Slot> },
+    /// All others: first scalar and part of each variable, and the slots of the pairs (p, q), p ≤ q, row by row.
+    General { parts: Vec<(usize, Part)>, slots: Vec<Slot> },
 }
 
-impl System {
-    fn new(graph: &Graph) -> Result<Self, SolveError> {
+impl<'a> System<'a> {
+    fn new(graph: &'a Graph) -> Result<Self, SolveError> {
         let parts: Vec<_> = graph.edges().iter().map(|e| parts_of(graph, e)).collect();
         let mut sizes = vec![6; graph.nodes().len().saturating_sub(1)];
         sizes.resize(sizes.len() + graph.scale_count(), 1);
         let pairs = parts
             .iter()
             .flat_map(|list| list.iter().enumerate().flat_map(move |(k, a)| list[k..].iter().map(move |b| (a.0, b.0))));
-        let pattern = BlockPattern::new(sizes, pairs)?;
-        let terms = parts.into_iter().map(|parts| {
-            let pairs = parts.iter().enumerate().flat_map(|(k, a)| parts[k..].iter().map(move |b| (a.0, b.0)));
-            let slots = pairs.filter_map(|(a, b)| pattern.slot(a, b)).collect();
-            Terms { slots, parts }
-        });
-        let terms = terms.collect();
-        Ok(Self { pattern, terms })
+        let pattern = BlockPattern::new(&sizes, pairs)?;
+        let terms = parts.into_iter().map(|parts| Terms::new(parts, &pattern)).collect();
+        Ok(Self { graph, pattern, terms })
+    }
+}
+
+impl Terms {
+    fn new(parts: Vec<(usize, Part)>, pattern: &BlockPattern) -> Self {
+        if parts.iter().all(|(_, part)| part.size() == 6) {
+            let find = |wanted: fn(&Part) -> bool| parts.iter().find(|(_, p)| wanted(p)).map(|(v, _)| *v);
+            let own = |v: usize| (pattern.start(v), pattern.slot(v, v));
+            let i = find(|p| matches!(p, Part::AnchorI));
+            let j = find(|p| matches!(p, Part::AnchorJ));
+            return Self::Rigid { i: i.map(own), j: j.map(own), cross: i.zip(j).map(|(a, b)| pattern.slot(a, b)) };
+        }
+        let pairs = parts.iter().enumerate().flat_map(|(k, a)| parts[k..].iter().map(move |b| (a.0, b.0)));
+        let slots = pairs.map(|(a, b)| pattern.slot(a, b)).collect();
+        Self::General { slots, parts: parts.into_iter().map(|(v, part)| (pattern.start(v), part)).collect() }
+    }
+}
+
+impl Objective for System<'_> {
+    type Values = Vec<Sim3>;
+
+    fn pattern(&self) -> &BlockPattern {
+        &self.pattern
     }
 
-    fn linearise(&self, graph: &Graph, values: &[Sim3], normal: &mut Normal) {
-        normal.h.clear();
-        normal.h.resize(self.pattern.value_count(), 0.0);
-        normal.g.clear();
-        normal.g.resize(self.pattern.scalars(), 0.0);
-        for (edge, terms) in graph.edges().iter().zip(&self.terms) {
-            let at = edge.linearise(values);
-            let weighted = edge.information * at.residual;
-            let jacobians: Vec<SMatrix<f64, 7, 6>> =
-                terms.parts.iter().map(|(_, part)| columns(*part, &at.by_i, &at.by_j)).collect();
-            let mut slots = terms.slots.iter();
-            for (p, (variable, part)) in terms.parts.iter().enumerate() {
-                let gradient = jacobians[p].transpose() * weighted;
-                let start = self.pattern.start(*variable);
-                for k in 0..part.size() {
-                    normal.g[start + k] += gradient[k];
-                }
-                let left = jacobians[p].transpose() * edge.information;
-                for (q, (_, other)) in terms.parts.iter().enumerate().skip(p) {
-                    let block = left * jacobians[q];
-                    if let Some(&slot) = slots.next() {
-                        self.pattern.add(&mut normal.h, slot, (part.size(), other.size()), |r, c| block[(r, c)]);
-                    }
-                }
+    fn cost(&self, values: &Vec<Sim3>) -> f64 {
+        self.graph.edges().iter().map(|e| e.chi2(values)).sum()
+    }
+
+    fn linearise(&self, values: &Vec<Sim3>, normal: &mut Normal) {
+        for (edge, terms) in self.graph.edges().iter().zip(&self.terms) {
+            match terms {
+                Terms::Rigid { i, j, cross } => add_rigid(edge, values, (*i, *j, *cross), normal),
+                Terms::General { parts, slots } => add_general(edge, values, parts, slots, normal),
             }
         }
     }
 
-    /// Solves `(H + μ diag H) δ = −g`.
-    fn step(&self, normal: &Normal, damping: f64) -> Result<Step, SolveError> {
-        let mut h = normal.h.clone();
-        let diagonal: Vec<f64> = self.pattern.diagonal().map(|at| normal.h[at]).collect();
-        for (at, d) in self.pattern.diagonal().zip(&diagonal) {
-            h[at] += damping * d;
-        }
-        let mut factor = Vec::new();
-        self.pattern.factorise(&h, &mut factor)?;
-        let mut delta: Vec<f64> = normal.g.iter().map(|g| -g).collect();
-        self.pattern.solve(&factor, &mut delta, 1)?;
-        let along_gradient: f64 = delta.iter().zip(&normal.g).map(|(x, g)| -x * g).sum();
-        let damped: f64 = delta.iter().zip(&diagonal).map(|(x, d)| damping * d * x * x).sum();
-        Ok(Step { delta, decrease: along_gradient + damped })
-    }
-
-    fn retract(&self, graph: &Graph, state: &State, delta: &[f64]) -> Vec<Sim3> {
+    fn retract(&self, values: &Vec<Sim3>, delta: &[f64]) -> Vec<Sim3> {
         let moved = |(k, value): (usize, &Sim3)| {
             let mut xi = Vector7::zeros();
             if k > 0 {
@@ -263,11 +167,58 @@ impl System {
                 xi.as_mut_slice()[..6].copy_from_slice(&delta[start..start + 6]);
             }
             let rigid = value.retract(&xi);
-            let Some(s) = graph.scale_of(k) else { return rigid };
-            let grow = libm::exp(delta[self.pattern.start(graph.nodes().len() - 1 + s)]);
+            let Some(s) = self.graph.scale_of(k) else { return rigid };
+            let grow = libm::exp(delta[self.pattern.start(self.graph.nodes().len() - 1 + s)]);
             Sim3::new(rigid.rotation, rigid.translation, rigid.scale * grow)
         };
-        state.values.iter().enumerate().map(moved).collect()
+        values.iter().enumerate().map(moved).collect()
+    }
+}
+
+/// With `J_i = −J_j A`, `A = Ad((X_i⁻¹ X_j)⁻¹)`: `H_jj = J_jᵀ W J_j`, `H_ij = −Aᵀ H_jj`, `H_ii = Aᵀ H_jj A`.
+fn add_rigid(
+    edge: &Edge,
+    values: &[Sim3],
+    (i, j, cross): (Option<(usize, Slot)>, Option<(usize, Slot)>, Option<Slot>),
+    normal: &mut Normal,
+) {
+    let (residual, by_j, adjoint) = edge.linearise_rigid(values);
+    let information: Matrix6<f64> = edge.information.fixed_view::<6, 6>(0, 0).into_owned();
+    let left = by_j.transpose() * information;
+    let (of_j, gradient) = (left * by_j, left * residual);
+    let crossed = adjoint.transpose() * of_j;
+    if let Some((start, slot)) = j {
+        BlockPattern::add(&mut normal.h, slot, &of_j);
+        normal.g[start..start + 6].iter_mut().zip(&gradient).for_each(|(g, x)| *g += x);
+    }
+    if let Some((start, slot)) = i {
+        BlockPattern::add(&mut normal.h, slot, &(crossed * adjoint));
+        let gradient = adjoint.transpose() * gradient;
+        normal.g[start..start + 6].iter_mut().zip(&gradient).for_each(|(g, x)| *g -= x);
+    }
+    if let Some(slot) = cross {
+        BlockPattern::add(&mut normal.h, slot, &-crossed);
+    }
+}
+
+fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[Slot], normal: &mut Normal) {
+    let at = edge.linearise(values);
+    let weighted = edge.information * at.residual;
+    let jacobians: Vec<SMatrix<f64, 7, 6>> =
+        parts.iter().map(|(_, part)| columns(*part, &at.by_i, &at.by_j)).collect();
+    let mut slots = slots.iter();
+    for (p, (start, part)) in parts.iter().enumerate() {
+        let gradient = jacobians[p].transpose() * weighted;
+        for k in 0..part.size() {
+            normal.g[start + k] += gradient[k];
+        }
+        let left = jacobians[p].transpose() * edge.information;
+        for (q, (_, other)) in parts.iter().enumerate().skip(p) {
+            let block = left * jacobians[q];
+            if let Some(&slot) = slots.next() {
+                BlockPattern::add(&mut normal.h, slot, &block.view((0, 0), (part.size(), other.size())));
+            }
+        }
     }
 }
 

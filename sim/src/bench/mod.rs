@@ -4,6 +4,7 @@ pub mod corr;
 pub mod cpu;
 pub mod frames;
 pub mod gossip;
+pub mod graph;
 pub mod outliers;
 pub mod peer;
 pub mod peers;
@@ -30,6 +31,11 @@ pub enum Bench {
     /// Robots hold real replicas of signed facts; radio, motion and time are simulated. Exit code 1 if a swarm did not
     /// converge in the time its case allows.
     Gossip(gossip::Gossip),
+    /// The joint estimate's solver on g2o graphs: minima, certificates, covariances and time, beside GTSAM
+    ///
+    /// Exit code 1 if a graph did not converge, was not certified, or missed its known optimum; 2 if a file cannot be
+    /// used.
+    Graph(graph::GraphBench),
     /// Frame-level consensus on seeded worlds: success, refusals and honesty of the covariance
     ///
     /// Two robots drive a figure-eight of about 120 m with drifting odometry; a cell has 20 alignments between them, of
@@ -52,6 +58,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
     match bench {
         Bench::Registration(options) => registration::run(&options),
         Bench::Gossip(options) => gossip::run(&options),
+        Bench::Graph(options) => graph::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }
 }

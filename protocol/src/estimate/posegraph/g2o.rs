@@ -1,0 +1,293 @@
+//! g2o text files (Kümmerle et al. 2011): decides which lines make a sound pose graph.
+//!
+//! Read: `VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`, `VERTEX_SE2`, `EDGE_SE2`, comments; `FIX` and `PARAMS_*` are skipped. The
+//! information of rotations is taken on the rotation vector, as GTSAM and SE-Sync do. Planar measurements become
+//! spatial ones that hold the plane: their information out of the plane is as large as the largest within it, and its
+//! value does not matter to the estimate, because nothing in the plane pulls out of it.
+
+use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_weights};
+use crate::geometry::so3::So3;
+use crate::geometry::{Se3, se3};
+use nalgebra::{Matrix3, Matrix6, Vector3};
+use std::fmt::Write;
+use thiserror::Error;
+
+/// Longest line, in bytes.
+pub const LINE_MAX: usize = 4096;
+/// How far a quaternion's norm may be from 1 before it is no rounding.
+const QUATERNION_NORM_SLACK: f64 = 1e-2;
+
+/// A line that cannot be part of a pose graph.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[error("line {line}: {what}")]
+pub struct G2oError {
+    /// Which line, from 1.
+    pub line: usize,
+    /// What is wrong with it, and how to mend it.
+    pub what: Fault,
+}
+
+/// What is wrong with a line.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum Fault {
+    /// A tag this format does not have here.
+    #[error("unknown tag {0:?}; pose graphs hold VERTEX_SE3:QUAT, EDGE_SE3:QUAT, VERTEX_SE2 and EDGE_SE2 lines")]
+    Tag(String),
+    /// Too few or too many fields.
+    #[error("{got} fields after the tag, {want} wanted")]
+    Fields {
+        /// As they should be.
+        want: usize,
+        /// As they are.
+        got: usize,
+    },
+    /// A field that is no number.
+    #[error("{0:?} is no finite number")]
+    Number(String),
+    /// A pose's name that is no whole number.
+    #[error("{0:?} is no pose id; ids are whole numbers from 0")]
+    Id(String),
+    /// A quaternion that is none.
+    #[error("the quaternion has norm {0:.3}, not 1; write it as x y z w of norm 1")]
+    Quaternion(f64),
+    /// An information matrix that is none.
+    #[error("the information matrix is not positive definite; give directions that are not measured a small positive value")]
+    Information,
+    /// Both ends are one pose.
+    #[error("measures pose {0} against itself; leave the line out")]
+    SelfLoop(u64),
+    /// A pose told twice.
+    #[error("pose {0} is told twice, with two values; leave one out")]
+    Twice(u64),
+    /// Planar and spatial lines in one file.
+    #[error("mixes planar and spatial lines; keep to one of SE2 and SE3:QUAT")]
+    Mixed,
+    /// A line that is too long.
+    #[error("longer than {LINE_MAX} bytes")]
+    Long,
+    /// Too many poses.
+    #[error("more than {POSES_MAX} poses; split the graph")]
+    Poses,
+    /// Too many measurements.
+    #[error("more than {MEASUREMENTS_MAX} measurements; split the graph")]
+    Measurements,
+}
+
+/// Reads a file line by line.
+#[derive(Clone, Debug, Default)]
+pub struct Parser {
+    graph: PoseGraph,
+    line: usize,
+    planar: Option<bool>,
+}
+
+impl Parser {
+    /// Begins the next file of the same graph: lines count from 1 again.
+    pub fn begin(&mut self) {
+        self.line = 0;
+    }
+
+    /// Takes the next line.
+    ///
+    /// # Errors
+    /// [`G2oError`] with its number; nothing of the line is taken then.
+    pub fn line(&mut self, text: &str) -> Result<(), G2oError> {
+        self.line += 1;
+        self.take(text).map_err(|what| G2oError { line: self.line, what })
+    }
+
+    /// The graph so far.
+    pub fn finish(mut self) -> PoseGraph {
+        self.graph.planar = self.planar.unwrap_or_default();
+        self.graph
+    }
+
+    fn take(&mut self, text: &str) -> Result<(), Fault> {
+        if text.len() > LINE_MAX {
+            return Err(Fault::Long);
+        }
+        let mut words = text.split_whitespace();
+        let Some(tag) = words.next() else { return Ok(()) };
+        let fields: Vec<&str> = words.collect();
+        match tag {
+            _ if tag.starts_with('#') || tag.starts_with("PARAMS_") || tag == "FIX" => Ok(()),
+            "VERTEX_SE3:QUAT" => {
+                let ([id], numbers) = parsed::<1, 7>(&fields)?;
+                self.pose(id, pose(&numbers)?, false)
+            }
+            "VERTEX_SE2" => {
+                let ([id], numbers) = parsed::<1, 3>(&fields)?;
+                self.pose(id, planar_pose(&numbers), true)
+            }
+            "EDGE_SE3:QUAT" => {
+                let (ends, numbers) = parsed::<2, 28>(&fields)?;
+                let information = symmetric::<6>(&numbers[7..]);
+                let (kappa, tau) = isotropic_weights(&information).ok_or(Fault::Information)?;
+                self.measurement(ends, pose(&numbers)?, information, (kappa, tau), false)
+            }
+            "EDGE_SE2" => {
+                let (ends, numbers) = parsed::<2, 9>(&fields)?;
+                let (information, weights) = from_plane(&symmetric::<3>(&numbers[3..])).ok_or(Fault::Information)?;
+                self.measurement(ends, planar_pose(&numbers), information, weights, true)
+            }
+            _ => Err(Fault::Tag(tag.chars().take(40).collect())),
+        }
+    }
+
+    fn pose(&mut self, id: u64, value: Se3, planar: bool) -> Result<(), Fault> {
+        self.of_kind(planar)?;
+        if self.graph.poses.get(&id).is_some_and(|known| known.is_some_and(|known| known != value)) {
+            return Err(Fault::Twice(id));
+        }
+        self.room_for(&[id])?;
+        self.graph.poses.insert(id, Some(value));
+        Ok(())
+    }
+
+    fn measurement(
+        &mut self,
+        [i, j]: [u64; 2],
+        t_i_j: Se3,
+        information: Matrix6<f64>,
+        (kappa, tau): (f64, f64),
+        planar: bool,
+    ) -> Result<(), Fault> {
+        self.of_kind(planar)?;
+        if i == j {
+            return Err(Fault::SelfLoop(i));
+        }
+        if super::covariance_of(&information).is_none() {
+            return Err(Fault::Information);
+        }
+        if self.graph.measurements.len() == MEASUREMENTS_MAX {
+            return Err(Fault::Measurements);
+        }
+        self.room_for(&[i, j])?;
+        self.graph.poses.entry(i).or_default();
+        self.graph.poses.entry(j).or_default();
+        let line = self.line;
+        self.graph.measurements.push(Measurement { i, j, t_i_j, information, kappa, tau, line });
+        Ok(())
+    }
+
+    fn of_kind(&mut self, planar: bool) -> Result<(), Fault> {
+        if *self.planar.get_or_insert(planar) == planar { Ok(()) } else { Err(Fault::Mixed) }
+    }
+
+    fn room_for(&self, ids: &[u64]) -> Result<(), Fault> {
+        let new = ids.iter().filter(|id| !self.graph.poses.contains_key(id)).count();
+        if self.graph.poses.len() + new > POSES_MAX { Err(Fault::Poses) } else { Ok(()) }
+    }
+}
+
+/// Ids, then numbers.
+fn parsed<const I: usize, const N: usize>(fields: &[&str]) -> Result<([u64; I], [f64; N]), Fault> {
+    if fields.len() != I + N {
+        return Err(Fault::Fields { want: I + N, got: fields.len() });
+    }
+    let (mut ids, mut numbers) = ([0; I], [0.0; N]);
+    for (out, text) in ids.iter_mut().zip(fields) {
+        *out = text.parse().map_err(|_| Fault::Id(cut(text)))?;
+    }
+    for (out, text) in numbers.iter_mut().zip(&fields[I..]) {
+        let number = text.parse::<f64>().ok().filter(|x| x.is_finite());
+        *out = number.ok_or_else(|| Fault::Number(cut(text)))?;
+    }
+    Ok((ids, numbers))
+}
+
+fn cut(text: &str) -> String {
+    text.chars().take(40).collect()
+}
+
+fn pose(numbers: &[f64]) -> Result<Se3, Fault> {
+    let xyzw = [numbers[3], numbers[4], numbers[5], numbers[6]];
+    let norm = xyzw.iter().map(|x| x * x).sum::<f64>().sqrt();
+    if (norm - 1.0).abs() > QUATERNION_NORM_SLACK {
+        return Err(Fault::Quaternion(norm));
+    }
+    Se3::from_xyzw(xyzw.map(|x| x / norm), [numbers[0], numbers[1], numbers[2]]).ok_or(Fault::Quaternion(norm))
+}
+
+fn planar_pose(numbers: &[f64]) -> Se3 {
+    Se3::new(So3::exp(&Vector3::new(0.0, 0.0, numbers[2])), Vector3::new(numbers[0], numbers[1], 0.0))
+}
+
+/// A symmetric matrix from its upper triangle, row by row.
+fn symmetric<const N: usize>(upper: &[f64]) -> nalgebra::SMatrix<f64, N, N> {
+    let mut out = nalgebra::SMatrix::zeros();
+    let cells = (0..N).flat_map(|r| (r..N).map(move |c| (r, c)));
+    for ((r, c), &x) in cells.zip(upper) {
+        out[(r, c)] = x;
+        out[(c, r)] = x;
+    }
+    out
+}
+
+/// The spatial information and SE-Sync's weights (κ, τ) of planar information in (x, y, θ): `τ = 2/tr(Σ_t)`, κ the
+/// information of the angle.
+fn from_plane(planar: &Matrix3<f64>) -> Option<(Matrix6<f64>, (f64, f64))> {
+    planar.cholesky()?;
+    let trace = planar.fixed_view::<2, 2>(0, 0).into_owned().try_inverse()?.trace();
+    let (stiff_t, stiff_r) = (planar[(0, 0)].max(planar[(1, 1)]), planar[(2, 2)]);
+    let mut out = Matrix6::from_diagonal(&se3::join(
+        &Vector3::new(0.0, 0.0, stiff_t),
+        &Vector3::new(stiff_r, stiff_r, 0.0),
+    ));
+    let places = [0, 1, 5];
+    for (r, &row) in places.iter().enumerate() {
+        for (c, &column) in places.iter().enumerate() {
+            out[(row, column)] = planar[(r, c)];
+        }
+    }
+    Some((out, (planar[(2, 2)], 2.0 / trace)))
+}
+
+/// A graph as a g2o file: poses with a value, then measurements. Planar graphs are written as such.
+pub fn write(graph: &PoseGraph) -> String {
+    let mut out = String::new();
+    for (id, value) in &graph.poses {
+        if let Some(value) = value {
+            let _ = if graph.planar {
+                writeln!(out, "VERTEX_SE2 {id} {}", plane_numbers(value))
+            } else {
+                writeln!(out, "VERTEX_SE3:QUAT {id} {}", pose_numbers(value))
+            };
+        }
+    }
+    for m in &graph.measurements {
+        let places: &[usize] = if graph.planar { &[0, 1, 5] } else { &[0, 1, 2, 3, 4, 5] };
+        let (tag, numbers) = match graph.planar {
+            true => ("EDGE_SE2", plane_numbers(&m.t_i_j)),
+            false => ("EDGE_SE3:QUAT", pose_numbers(&m.t_i_j)),
+        };
+        let _ = write!(out, "{tag} {} {} {numbers}", m.i, m.j);
+        for (k, &r) in places.iter().enumerate() {
+            for &c in &places[k..] {
+                let _ = write!(out, " {}", m.information[(r, c)]);
+            }
+        }
+        out.push('\n');
+    }
+    out
+}
+
+/// Poses as a TUM trajectory, the id in place of the time.
+pub fn write_tum<'a>(poses: impl IntoIterator<Item = (&'a u64, &'a Se3)>) -> String {
+    let mut out = String::new();
+    for (id, value) in poses {
+        let _ = writeln!(out, "{id} {}", pose_numbers(value));
+    }
+    out
+}
+
+/// `x y z qx qy qz qw`.
+fn pose_numbers(t: &Se3) -> String {
+    let (p, [x, y, z, w]) = (t.translation, t.rotation.xyzw());
+    format!("{} {} {} {x} {y} {z} {w}", p.x, p.y, p.z)
+}
+
+/// `x y θ`.
+fn plane_numbers(t: &Se3) -> String {
+    format!("{} {} {}", t.translation.x, t.translation.y, t.rotation.log().z)
+}

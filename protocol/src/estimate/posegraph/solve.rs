@@ -1,0 +1,133 @@
+//! Solving a pose graph: decides the start, and says what is known about the minimum that is found.
+
+use super::{PoseGraph, covariance_of};
+use crate::estimate::certificate::Certificate;
+use crate::estimate::graph::{Factor, Graph, GraphError, Label};
+use crate::estimate::solve::{Solution, SolveError, solve};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
+use crate::ids::{FrameId, RobotId, SubmapId};
+use std::collections::{BTreeMap, BTreeSet};
+use thiserror::Error;
+
+/// Where a minimisation starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// Chordal relaxation: needs no values and is close to the global minimum where noise is moderate.
+    Relaxed,
+    /// The minimum of the chordal cost, which can be certified; costs more, and is right where noise is large.
+    Chordal,
+    /// The values of the file.
+    Given,
+}
+
+/// Why a graph could not be solved.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum PoseGraphError {
+    /// The numbers do not allow it.
+    #[error(transparent)]
+    Solve(#[from] SolveError),
+    /// A measurement that cannot be used.
+    #[error(transparent)]
+    Graph(#[from] GraphError),
+    /// The start wants a value that the file does not give.
+    #[error("pose {0} has no value; add its vertex or start from the relaxation")]
+    NoValue(u64),
+    /// Poses that no measurement ties together.
+    #[error("the graph has {0} parts; solve each by itself")]
+    Parts(usize),
+}
+
+/// The certified side of a solution.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ChordalOutcome {
+    /// SE-Sync's cost at its minimum.
+    pub cost: f64,
+    /// Iterations used.
+    pub iterations: usize,
+    /// Whether the last step was negligible.
+    pub converged: bool,
+    /// Whether that minimum is the global one.
+    pub certificate: Certificate,
+}
+
+/// A solved graph.
+#[derive(Clone, Debug)]
+pub struct Solved {
+    /// Poses' names, in the order of [`Solved::values`].
+    pub ids: Vec<u64>,
+    /// `t_world_pose`; the first pose is the identity, or as given.
+    pub values: Vec<Se3>,
+    /// The solution from which covariances are drawn.
+    pub solution: Solution,
+}
+
+impl PoseGraph {
+    /// The start, in the order of the poses.
+    ///
+    /// # Errors
+    /// [`PoseGraphError`] if a value is wanted that is not there, or the graph is not connected.
+    pub fn start(&self, start: Start, iterations_max: usize) -> Result<Vec<Se3>, PoseGraphError> {
+        match start {
+            Start::Relaxed => Ok(self.chordal().relaxed()?),
+            Start::Chordal => {
+                let chordal = self.chordal();
+                Ok(chordal.minimise(&chordal.relaxed()?, iterations_max)?.values)
+            }
+            Start::Given => {
+                let given = self.poses.iter().map(|(&id, value)| value.ok_or(PoseGraphError::NoValue(id)));
+                given.collect()
+            }
+        }
+    }
+
+    /// The minimum of SE-Sync's cost with its certificate; the poses in the order of [`PoseGraph::poses`].
+    ///
+    /// # Errors
+    /// [`PoseGraphError`] if the graph is not connected or cannot be solved.
+    pub fn certified(&self, iterations_max: usize) -> Result<(Vec<Se3>, ChordalOutcome), PoseGraphError> {
+        let chordal = self.chordal();
+        let minimum = chordal.minimise(&chordal.relaxed()?, iterations_max)?;
+        let certificate = chordal.certify(&minimum.values)?;
+        let (cost, iterations, converged) = (minimum.cost, minimum.iterations, minimum.converged);
+        Ok((minimum.values, ChordalOutcome { cost, iterations, converged, certificate }))
+    }
+
+    /// The minimum of χ² near a start.
+    ///
+    /// # Errors
+    /// [`PoseGraphError`] if the graph is not connected or cannot be solved.
+    pub fn solve(&self, start: &[Se3], iterations_max: usize) -> Result<Solved, PoseGraphError> {
+        let place: BTreeMap<u64, SubmapId> = self.poses.keys().copied().zip((0..).map(node)).collect();
+        let factor = |m: &super::Measurement| {
+            // An information that is not positive definite does not pass the parsers.
+            let covariance = covariance_of(&m.information).unwrap_or_else(|| Covariance::new_or_wider(m.information));
+            let t_i_j = Relative::Metric(PoseWithCovariance { pose: m.t_i_j, covariance });
+            Factor { label: Label::Odometry, i: place[&m.i], j: place[&m.j], t_i_j, weight: 1.0 }
+        };
+        let factors = self.measurements.iter().map(factor).collect();
+        let nodes: BTreeSet<SubmapId> = place.values().copied().collect();
+        let mut graphs = Graph::components(&nodes, &BTreeSet::new(), factors)?;
+        let graph = match (graphs.pop(), graphs.len()) {
+            (Some(graph), 0) => graph,
+            (_, more) => return Err(PoseGraphError::Parts(more + 1)),
+        };
+        let solution = solve(graph, start.iter().map(Sim3::from_se3).collect(), iterations_max)?;
+        let values = solution.values().iter().map(Sim3::to_se3).collect();
+        Ok(Solved { ids: self.poses.keys().copied().collect(), values, solution })
+    }
+}
+
+impl Solved {
+    /// The covariance of every pose relative to the first (local perturbation of `t_first_pose`), by selected
+    /// inversion; in the order of [`Solved::ids`].
+    pub fn marginals(&self) -> Vec<(u64, Covariance<6>)> {
+        let relations = self.solution.relatives_to(node(0), &BTreeSet::new());
+        let rigid = relations.into_iter().filter_map(|(id, t)| Some((id.index as usize, t.metric()?.covariance)));
+        rigid.filter_map(|(k, covariance)| Some((*self.ids.get(k)?, covariance))).collect()
+    }
+}
+
+/// The estimate's name of the `k`-th pose.
+fn node(k: u32) -> SubmapId {
+    SubmapId { frame: FrameId { robot: RobotId([0; 8]), epoch: 0 }, index: k }
+}

@@ -1,0 +1,118 @@
+//! The numeric side: decides the factor of `H`, front by front, and solves with it.
+
+use super::dense::{Panel, Scratch};
+use super::{BlockPattern, Front, Piece};
+use crate::estimate::solve::SolveError;
+
+/// A Cholesky factor `H = L Lᵀ`, its panels laid out as [`BlockPattern`] says.
+#[derive(Clone, Debug, Default)]
+pub(in crate::estimate) struct Factor {
+    pub(super) values: Vec<f64>,
+}
+
+impl BlockPattern {
+    /// Factorises `H = L Lᵀ`.
+    ///
+    /// # Errors
+    /// [`SolveError::Underconstrained`] with the variable at which a pivot is not positive.
+    pub(in crate::estimate) fn factorise(&self, h: Vec<f64>) -> Result<Factor, SolveError> {
+        let mut values = h;
+        let mut updates: Vec<Vec<f64>> = vec![Vec::new(); self.fronts.len()];
+        let mut scratch = Scratch::default();
+        for (k, front) in self.fronts.iter().enumerate() {
+            let mut update = vec![0.0; front.depth() * front.depth()];
+            let panel = &mut values[front.offset..front.offset + front.height * front.pivots.len()];
+            for &child in &front.children {
+                let given = core::mem::take(&mut updates[child]);
+                assemble(&self.fronts[child], &given, front, panel, &mut update);
+            }
+            let mut panel = Panel { values: panel, height: front.height, columns: front.pivots.len() };
+            panel.eliminate(&mut scratch).map_err(|index| SolveError::Underconstrained {
+                variable: self.variable_of(front.pivots.start + index),
+            })?;
+            panel.subtract_square(&mut update);
+            updates[k] = update;
+        }
+        if values.iter().all(|x| x.is_finite()) { Ok(Factor { values }) } else { Err(SolveError::NotFinite) }
+    }
+
+    /// Solves `L Lᵀ x = b` in place for the right-hand sides that follow one another in `b`.
+    pub(in crate::estimate) fn solve(&self, factor: &Factor, b: &mut [f64]) {
+        if self.scalars() == 0 {
+            return;
+        }
+        let mut gathered = Vec::new();
+        for front in &self.fronts {
+            for x in b.chunks_exact_mut(self.scalars()) {
+                front.forward(&factor.values, x, &mut gathered);
+            }
+        }
+        for front in self.fronts.iter().rev() {
+            for x in b.chunks_exact_mut(self.scalars()) {
+                front.backward(&factor.values, x, &mut gathered);
+            }
+        }
+    }
+}
+
+impl Front {
+    fn panel<'a>(&self, values: &'a [f64]) -> impl DoubleEndedIterator<Item = &'a [f64]> + ExactSizeIterator {
+        values[self.offset..self.offset + self.height * self.pivots.len()].chunks_exact(self.height)
+    }
+
+    /// `x_J ← L⁻¹ x_J`, then `x_I ← x_I − B x_J`.
+    fn forward(&self, values: &[f64], x: &mut [f64], gathered: &mut Vec<f64>) {
+        gathered.clear();
+        gathered.resize(self.depth(), 0.0);
+        let own = &mut x[self.pivots.clone()];
+        for (k, column) in self.panel(values).enumerate() {
+            let (square, below) = column.split_at(own.len());
+            own[k] /= square[k];
+            let at = own[k];
+            own[k + 1..].iter_mut().zip(&square[k + 1..]).for_each(|(x, l)| *x -= l * at);
+            gathered.iter_mut().zip(below).for_each(|(x, l)| *x += l * at);
+        }
+        let mut rest = &gathered[..];
+        for run in &self.below {
+            let (now, later) = rest.split_at(run.len());
+            x[run.clone()].iter_mut().zip(now).for_each(|(x, y)| *x -= y);
+            rest = later;
+        }
+    }
+
+    /// `x_J ← L⁻ᵀ (x_J − Bᵀ x_I)`.
+    fn backward(&self, values: &[f64], x: &mut [f64], gathered: &mut Vec<f64>) {
+        gathered.clear();
+        self.below.iter().for_each(|run| gathered.extend_from_slice(&x[run.clone()]));
+        let own = &mut x[self.pivots.clone()];
+        for (k, column) in self.panel(values).enumerate().rev() {
+            let (square, below) = column.split_at(own.len());
+            let known: f64 = own[k + 1..].iter().zip(&square[k + 1..]).map(|(x, l)| x * l).sum();
+            let known = known + below.iter().zip(&*gathered).map(|(l, x)| l * x).sum::<f64>();
+            own[k] = (own[k] - known) / square[k];
+        }
+    }
+}
+
+/// Adds a child's update to its parent: what falls on the parent's pivots to the panel, the rest to the parent's own
+/// update. Lower triangles on both sides.
+fn assemble(child: &Front, given: &[f64], parent: &Front, panel: &mut [f64], update: &mut [f64]) {
+    let (depth, columns) = (child.depth(), parent.pivots.len());
+    for (k, from) in child.into_parent.iter().enumerate() {
+        for c in 0..from.length {
+            let given = &given[(from.from + c) * depth..(from.from + c + 1) * depth];
+            let column = from.to + c;
+            let (target, height, above) = if column < columns {
+                (&mut panel[column * parent.height..], parent.height, 0)
+            } else {
+                (&mut update[(column - columns) * parent.depth()..], parent.depth(), columns)
+            };
+            let target = &mut target[..height];
+            let diagonal = Piece { from: from.from + c, to: column, length: from.length - c };
+            for piece in core::iter::once(&diagonal).chain(&child.into_parent[k + 1..]) {
+                let to = &mut target[piece.to - above..piece.to - above + piece.length];
+                to.iter_mut().zip(&given[piece.from..piece.from + piece.length]).for_each(|(t, g)| *t += g);
+            }
+        }
+    }
+}

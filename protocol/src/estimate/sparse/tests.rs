@@ -1,0 +1,92 @@
+//! Factor, solutions and entries of the inverse against dense algebra.
+
+use super::*;
+use nalgebra::{DMatrix, DVector};
+use proptest::prelude::*;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// A positive definite matrix with blocks of random sizes where `pairs` couple them, and its pattern.
+struct Case {
+    sizes: Vec<usize>,
+    pattern: BlockPattern,
+    values: Vec<f64>,
+    dense: DMatrix<f64>,
+}
+
+impl Case {
+    fn new(seed: u64, variables: usize, couplings: usize) -> Self {
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+        let sizes: Vec<usize> = (0..variables).map(|_| rng.random_range(1..7)).collect();
+        let mut pairs: Vec<(usize, usize)> = (0..variables).map(|v| (v, v)).collect();
+        pairs.extend((1..variables).filter(|_| seed % 3 > 0).map(|v| (v - 1, v)));
+        pairs.extend((0..couplings).map(|_| (rng.random_range(0..variables), rng.random_range(0..variables))));
+        let pattern = BlockPattern::new(&sizes, pairs.iter().copied()).unwrap();
+        let mut values = vec![0.0; pattern.value_count()];
+        let mut dense = DMatrix::zeros(pattern.scalars(), pattern.scalars());
+        for &(a, b) in &pairs {
+            let mut m = DMatrix::from_fn(sizes[a], sizes[b], |_, _| rng.random_range(-1.0..1.0));
+            if a == b {
+                m = &m + m.transpose() + DMatrix::identity(sizes[a], sizes[a]) * 6.0 * pairs.len() as f64;
+            }
+            BlockPattern::add(&mut values, pattern.slot(a, b), &m);
+            let at = (pattern.start(a), pattern.start(b));
+            let mut block = dense.view_mut(at, m.shape());
+            block += &m;
+            if a != b {
+                let mut block = dense.view_mut((at.1, at.0), (m.ncols(), m.nrows()));
+                block += m.transpose();
+            }
+        }
+        Self { sizes, pattern, values, dense }
+    }
+}
+
+proptest! {
+    #[test]
+    fn solves_and_inverts_like_dense_algebra(seed: u64, variables in 1usize..40, couplings in 0usize..60) {
+        let case = Case::new(seed, variables, couplings);
+        let factor = case.pattern.factorise(case.values.clone()).unwrap();
+        let inverse = case.dense.clone().try_inverse().unwrap();
+        let n = case.pattern.scalars();
+        let b = DVector::from_fn(2 * n, |r, _| (r as f64).sin());
+        let mut x = b.as_slice().to_vec();
+        case.pattern.solve(&factor, &mut x);
+        for k in 0..2 {
+            let want = &inverse * b.rows(k * n, n);
+            prop_assert!((DVector::from_column_slice(&x[k * n..(k + 1) * n]) - want).amax() < 1e-12);
+        }
+        let selected = case.pattern.selected_inverse(&factor);
+        for a in 0..variables {
+            for b in 0..variables {
+                for (r, c) in (0..case.sizes[a]).flat_map(|r| (0..case.sizes[b]).map(move |c| (r, c))) {
+                    let want = inverse[(case.pattern.start(a) + r, case.pattern.start(b) + c)];
+                    let got = selected.get((a, r), (b, c));
+                    prop_assert!(got.is_none_or(|got| (got - want).abs() < 1e-12));
+                    prop_assert!(got.is_some() || a != b);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_diagonal_is_where_it_is_said_to_be() {
+    let case = Case::new(7, 30, 40);
+    let got: Vec<f64> = case.pattern.diagonal().map(|at| case.values[at]).collect();
+    assert_eq!(got, case.dense.diagonal().as_slice());
+}
+
+#[test]
+fn a_pivot_that_is_not_positive_names_its_variable() {
+    let case = Case::new(4, 30, 40);
+    for variable in [0, 13, 29] {
+        let mut values = case.values.clone();
+        let slot = case.pattern.slot(variable, variable);
+        values[slot.at + (case.sizes[variable] - 1) * (slot.stride + 1)] = -1e9;
+        assert_eq!(case.pattern.factorise(values.clone()).unwrap_err(), SolveError::Underconstrained { variable });
+    }
+    let mut values = case.values.clone();
+    values[case.pattern.slot(5, 5).at] = f64::NAN;
+    assert!(case.pattern.factorise(values.clone()).is_err());
+}

@@ -1,0 +1,53 @@
+//! The joint estimate's solver on benchmark graphs: minima, certificates, covariances and time, beside GTSAM.
+
+mod files;
+mod measure;
+mod peer;
+mod table;
+
+use crate::bar::progress_bar;
+use clap::Args;
+use std::io::Write;
+use std::path::PathBuf;
+
+/// What to solve and beside whom.
+#[derive(Debug, Args)]
+pub struct GraphBench {
+    /// Folder of g2o graphs, searched through; a folder of robots' files is one graph. Certified optima come from the
+    /// optima.csv in it
+    #[arg(long, value_name = "DIR")]
+    pub data: PathBuf,
+    /// Only graphs whose name contains this
+    #[arg(long, value_name = "STR", default_value = "")]
+    pub filter: String,
+    /// Measure GTSAM on the same graphs, in this Python interpreter
+    #[arg(long, value_name = "PYTHON")]
+    pub peer_python: Option<PathBuf>,
+    /// Solves of each kind; the fastest counts, for us and for the peer
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=20))]
+    pub repeats: u8,
+}
+
+/// Solves, prints. Returns whether every graph with a known optimum was solved to it and certified.
+///
+/// # Errors
+/// A folder, file or interpreter that cannot be used.
+pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
+    let optima = files::optima(&options.data)?;
+    let sources = files::find(&options.data, &optima, &options.filter)?;
+    let bar = progress_bar(sources.len() as u64, "graphs")?;
+    let mut rows = Vec::new();
+    for source in &sources {
+        let graph = source.read()?;
+        let measured = measure::measure(&graph, options.repeats)?;
+        let peer = match &options.peer_python {
+            Some(python) if source.files.len() == 1 => Some(peer::measure(python, &source.files[0], options.repeats)?),
+            _ => None,
+        };
+        rows.push(table::Row { name: source.name.clone(), optimum: optima.get(&source.name).copied(), measured, peer });
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    write!(std::io::stdout().lock(), "{}", table::table(&rows))?;
+    Ok(rows.iter().all(table::Row::is_good))
+}

@@ -1,0 +1,41 @@
+//! GTSAM on the same file: a Python interpreter runs `sim/bench/peer_graph.py`.
+
+use anyhow::{Context, bail};
+use serde::Deserialize;
+use std::path::Path;
+use std::process::Command;
+
+const SCRIPT: &str = include_str!("../../../bench/peer_graph.py");
+
+/// What GTSAM came to.
+#[derive(Clone, Copy, Debug, Deserialize)]
+pub(super) struct Peer {
+    /// Twice its error: χ².
+    pub(super) chi2: f64,
+    pub(super) solve_s: f64,
+    /// All covariances, extrapolated from `marginals_of` poses.
+    pub(super) marginals_s: f64,
+    pub(super) marginals_of: usize,
+    /// Sum of the variances of those poses, relative to the first.
+    pub(super) trace: f64,
+}
+
+/// Solves `file` with GTSAM.
+///
+/// # Errors
+/// An interpreter without GTSAM, or output that cannot be read.
+pub(super) fn measure(python: &Path, file: &Path, repeats: u8) -> anyhow::Result<Peer> {
+    let output = Command::new(python)
+        .args(["-c", SCRIPT])
+        .arg(file)
+        .arg(repeats.to_string())
+        .output()
+        .with_context(|| format!("{}: no Python interpreter starts there", python.display()))?;
+    if !output.status.success() {
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        bail!("peer on {}: {}", file.display(), said.lines().last().unwrap_or("no reason given"));
+    }
+    let text = String::from_utf8_lossy(&output.stdout);
+    let line = text.lines().rev().find(|line| line.starts_with('{')).context("the peer printed no result")?;
+    serde_json::from_str(line).with_context(|| format!("the peer's {line:?}"))
+}
