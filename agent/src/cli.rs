@@ -1,7 +1,7 @@
 //! The command line. Exit codes: 0, all went well; 1, it did not (a check failed, the agent could not go on); 2, the
 //! command line or the configuration is wrong.
 
-use crate::commands::{check, keys, replay, run, store, watch};
+use crate::commands::{check, graph, keys, replay, run, store, watch};
 use crate::config::FileConfigError;
 use crate::demo::{self, DemoArgs};
 use crate::host::HostError;
@@ -42,6 +42,9 @@ pub enum Command {
     /// Look into a robot's store of facts: is it sound, what does it hold.
     #[command(subcommand)]
     Store(store::StoreCommand),
+    /// Solve pose graphs in files with the estimator that agents use.
+    #[command(subcommand)]
+    Graph(graph::GraphCommand),
     /// Run an agent's journal through the core again and compare the result.
     Replay(replay::ReplayArgs),
 }
@@ -74,6 +77,7 @@ fn dispatch(command: Command) -> Result<bool> {
         Command::Check(args) => check::run(&args),
         Command::Keys(command) => keys::run(command),
         Command::Store(command) => store::run(&command),
+        Command::Graph(command) => graph::run(&command),
         Command::Replay(args) => replay::run(&args),
     }
 }

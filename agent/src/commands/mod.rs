@@ -1,6 +1,7 @@
 //! What the program does, a file per subcommand.
 
 pub mod check;
+pub mod graph;
 pub mod keys;
 pub mod replay;
 pub mod run;

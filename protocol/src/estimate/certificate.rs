@@ -8,7 +8,7 @@
 
 use super::chordal::{ChordalEdge, ChordalGraph, Pose};
 use super::solve::SolveError;
-use super::sparse::{BlockPattern, Factor};
+use super::sparse::{BlockPattern, Factor, Workspace};
 use crate::geometry::Se3;
 use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
 use faer::matrix_free::LinOp;
@@ -26,6 +26,9 @@ const SHIFT_STEP: f64 = 10.0;
 const SHIFTS_MAX: usize = 8;
 /// Relative accuracy wanted of the eigenvalue.
 const EIGENVALUE_TOLERANCE: f64 = 1e-6;
+
+/// Up to so many rows all eigenvalues are computed: Lanczos needs some room.
+const DENSE_MAX: usize = 192;
 
 /// What is known about a minimum.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -105,13 +108,18 @@ impl Shifted {
         for node in 0..self.nodes {
             BlockPattern::add(&mut h, self.pattern.slot(node, node), &(Matrix3::identity() * shift));
         }
-        self.pattern.factorise(h)
+        self.pattern.factorise(h, &mut Workspace::default())
     }
 
     /// The smallest eigenvalue, from the largest of `(S + ηI)⁻¹`; `None` if Lanczos did not converge.
     fn eigenvalue(&self, factor: &Factor, shift: f64) -> Option<f64> {
         let operator = Inverse { matrix: self, factor };
         let n = 3 * self.nodes;
+        if n <= DENSE_MAX {
+            let inverse = operator.dense();
+            let largest = inverse.symmetric_eigenvalues().max();
+            return Some(1.0 / largest - shift);
+        }
         let start = Mat::from_fn(n, 1, |r, _| libm::sin(1.0 + 1.7 * r as f64));
         let start = &start * faer::Scale(1.0 / start.norm_l2());
         let mut vectors = Mat::zeros(n, 1);
@@ -143,7 +151,7 @@ struct CostTerms {
 impl CostTerms {
     fn new(edge: &ChordalEdge) -> Self {
         let (kappa, tau) = (edge.kappa, edge.tau);
-        let (r, t) = (edge.t_i_j.rotation.matrix(), edge.t_i_j.translation);
+        let (r, t) = (edge.r_i_j, edge.p_i_j);
         let block = |rotation: Matrix3<f64>, right: Vector3<f64>, bottom: Vector3<f64>, corner: f64| {
             let mut m = DMatrix::zeros(4, 4);
             m.view_mut((0, 0), (3, 3)).copy_from(&rotation);
@@ -166,11 +174,11 @@ fn multipliers(graph: &ChordalGraph, values: &[Pose]) -> Vec<Matrix3<f64>> {
     let mut out = vec![Matrix3::zeros(); graph.nodes];
     for edge in &graph.edges {
         let (i, j) = (&values[edge.i], &values[edge.j]);
-        let (r_i_j, t_i_j) = (edge.t_i_j.rotation.matrix(), edge.t_i_j.translation);
-        let rotation = (j.r - i.r * r_i_j) * edge.kappa;
+        let (r_i_j, t_i_j) = (edge.r_i_j, edge.p_i_j);
         let translation = (j.t - i.t - i.r * t_i_j) * edge.tau;
-        out[edge.i] -= i.r.transpose() * (rotation * r_i_j.transpose() + translation * t_i_j.transpose());
-        out[edge.j] += j.r.transpose() * rotation;
+        let of_i = (i.r - j.r * r_i_j.transpose()) * edge.kappa - translation * t_i_j.transpose();
+        out[edge.i] += i.r.transpose() * of_i;
+        out[edge.j] += j.r.transpose() * (j.r - i.r * r_i_j) * edge.kappa;
     }
     out.iter().map(|m| (m + m.transpose()) * 0.5).collect()
 }
@@ -179,6 +187,16 @@ fn multipliers(graph: &ChordalGraph, values: &[Pose]) -> Vec<Matrix3<f64>> {
 struct Inverse<'a> {
     matrix: &'a Shifted,
     factor: &'a Factor,
+}
+
+impl Inverse<'_> {
+    fn dense(&self) -> DMatrix<f64> {
+        let n = 3 * self.matrix.nodes;
+        let mut out = Mat::zeros(n, n);
+        let identity = Mat::<f64>::identity(n, n);
+        self.apply(out.as_mut(), identity.as_ref(), Par::Seq, MemStack::new(&mut MemBuffer::new(StackReq::EMPTY)));
+        DMatrix::from_fn(n, n, |r, c| 0.5 * (out[(r, c)] + out[(c, r)]))
+    }
 }
 
 impl core::fmt::Debug for Inverse<'_> {

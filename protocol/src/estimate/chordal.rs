@@ -1,5 +1,5 @@
 //! The chordal cost of pose graphs, `F = Σ κ‖R_j − R_i R_ij‖²_F + τ‖t_j − t_i − R_i t_ij‖²` (Rosen et al. 2019, "SE-Sync",
-//! eq. 3): decides where a minimisation starts that odometry would lead astray, and finds the minimum that
+//! eq. 3), with `κ (6 − 2 tr(R_jᵀ R_i R_ij))` for the first term where R_ij is only nearly a rotation: decides where a minimisation starts that odometry would lead astray, and finds the minimum that
 //! [`super::certificate`] can prove to be global.
 //!
 //! Start: without the constraint that rotations be rotations, two linear least-squares problems (Carlone et al. 2015,
@@ -8,7 +8,7 @@
 
 use super::minimise::{Normal, Objective, minimise};
 use super::solve::SolveError;
-use super::sparse::{BlockPattern, Slot};
+use super::sparse::{BlockPattern, Slot, Workspace};
 use crate::geometry::so3::{So3, hat};
 use crate::geometry::{Se3, se3};
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
@@ -23,8 +23,10 @@ pub struct ChordalEdge {
     pub i: usize,
     /// Source node.
     pub j: usize,
-    /// `t_i_j`.
-    pub t_i_j: Se3,
+    /// Rotation of `t_i_j`: one as near as its source prints it, because a known optimum is that of what is printed.
+    pub r_i_j: Matrix3<f64>,
+    /// Translation of `t_i_j`.
+    pub p_i_j: Vector3<f64>,
     /// Weight κ of the rotation; positive.
     pub kappa: f64,
     /// Weight τ of the translation; positive.
@@ -94,7 +96,7 @@ impl ChordalGraph {
         let mut h = vec![0.0; pattern.value_count()];
         let mut b = vec![0.0; 3 * pattern.scalars()];
         for edge in &self.edges {
-            let r_i_j = edge.t_i_j.rotation.matrix();
+            let r_i_j = edge.r_i_j;
             for node in [edge.i, edge.j].into_iter().filter(|&node| node > 0) {
                 let slot = pattern.slot(node - 1, node - 1);
                 BlockPattern::add(&mut h, slot, &(Matrix3::identity() * edge.kappa));
@@ -111,7 +113,7 @@ impl ChordalGraph {
                 }
             }
         }
-        let factor = pattern.factorise(h)?;
+        let factor = pattern.factorise(h, &mut Workspace::default())?;
         pattern.solve(&factor, &mut b);
         let row = |k: usize, node: usize| {
             let at = k * pattern.scalars() + pattern.start(node - 1);
@@ -130,7 +132,7 @@ impl ChordalGraph {
         let mut h = vec![0.0; pattern.value_count()];
         let mut b = vec![0.0; 3 * pattern.scalars()];
         for edge in &self.edges {
-            let step = rotations[edge.i] * edge.t_i_j.translation * edge.tau;
+            let step = rotations[edge.i] * edge.p_i_j * edge.tau;
             let weight = nalgebra::Matrix1::new(edge.tau);
             for (node, sign) in [(edge.i, -1.0), (edge.j, 1.0)].into_iter().filter(|(node, _)| *node > 0) {
                 BlockPattern::add(&mut h, pattern.slot(node - 1, node - 1), &weight);
@@ -143,7 +145,7 @@ impl ChordalGraph {
                 BlockPattern::add(&mut h, pattern.slot(edge.i - 1, edge.j - 1), &-weight);
             }
         }
-        let factor = pattern.factorise(h)?;
+        let factor = pattern.factorise(h, &mut Workspace::default())?;
         pattern.solve(&factor, &mut b);
         let n = pattern.scalars();
         let place = |node: usize| pattern.start(node - 1);
@@ -205,9 +207,9 @@ impl<'a> Chordal<'a> {
     fn cost_of(graph: &ChordalGraph, values: &[Pose]) -> f64 {
         let one = |edge: &ChordalEdge| {
             let (i, j) = (&values[edge.i], &values[edge.j]);
-            let rotation = (j.r - i.r * edge.t_i_j.rotation.matrix()).norm_squared();
-            let translation = (j.t - i.t - i.r * edge.t_i_j.translation).norm_squared();
-            edge.kappa * rotation + edge.tau * translation
+            let rotation = (j.r - i.r * edge.r_i_j).norm_squared();
+            let translation = (j.t - i.t - i.r * edge.p_i_j).norm_squared();
+            edge.kappa * (rotation + 3.0 - edge.r_i_j.norm_squared()) + edge.tau * translation
         };
         graph.edges.iter().map(one).sum()
     }
@@ -267,7 +269,7 @@ impl EdgeTerms {
     /// `−κ (A − Aᵀ)^∨` by φ_j, `κ (B − Bᵀ)^∨` by φ_i, and for the translation that of `q` with `∂q/∂ρ_i = −I`,
     /// `∂q/∂φ_i = t_ij^`, `∂q/∂ρ_j = D`. The Gauss–Newton Hessian takes `A = B = I` and drops `q`.
     fn new(edge: &ChordalEdge, i: &Pose, j: &Pose, exact: bool) -> Self {
-        let (r_i_j, t_i_j) = (edge.t_i_j.rotation.matrix(), edge.t_i_j.translation);
+        let (r_i_j, t_i_j) = (edge.r_i_j, edge.p_i_j);
         let d = i.r.transpose() * j.r;
         let (a, b) = (d.transpose() * r_i_j, r_i_j * d.transpose());
         let q = i.r.transpose() * (j.t - i.t) - t_i_j;
@@ -275,8 +277,7 @@ impl EdgeTerms {
         let (blank, none) = (Matrix6::zeros(), Vector6::zeros());
         let mut out = Self { ii: blank, ij: blank, jj: blank, i: none, j: none };
         let by_phi_i = hat(&t_i_j);
-        let (mut rotation_ii, mut rotation_jj, mut rotation_ij) =
-            (identity * 2.0, identity * 2.0, d * -2.0);
+        let (mut rotation_ii, mut rotation_jj, mut rotation_ij) = (identity * 2.0, identity * 2.0, d * -2.0);
         let mut lever = by_phi_i.transpose() * by_phi_i;
         if exact {
             let symmetric = |m: &Matrix3<f64>| (m + m.transpose()) * 0.5;

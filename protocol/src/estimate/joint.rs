@@ -15,7 +15,7 @@ use super::pairs::{self, Pair};
 use super::reweight::{self, Drop};
 use super::solve::{Solution, SolveError, solve};
 use crate::config::EstimateConfig;
-use crate::geometry::{PoseWithCovariance, Relative, Sim3};
+use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
@@ -311,6 +311,13 @@ impl JointEstimate {
     /// The frames of each component.
     pub fn components(&self) -> impl ExactSizeIterator<Item = &[FrameId]> {
         self.components.iter().map(|c| c.frames.as_slice())
+    }
+
+    /// `t_world_anchor` of a component's anchors, in the component's own arbitrary frame; empty if it was not solved.
+    pub fn values(&self, component: usize) -> BTreeMap<SubmapId, Se3> {
+        let solution = self.components.get(component).and_then(|c| c.solution.as_ref());
+        let places = solution.into_iter().flat_map(|s| s.graph().nodes().iter().copied().zip(s.values()));
+        places.map(|(id, value)| (id, value.to_se3())).collect()
     }
 
     /// `t_i_j` between two anchors of one component, cross-correlations included: rigid between metric frames and

@@ -5,6 +5,7 @@
 //! inversion (MATH §3: joint covariances, never sums of marginals).
 
 use super::solve::Solution;
+use super::sparse::SelectedInverse;
 use crate::geometry::sim3::{Matrix7, Vector7};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
 use crate::ids::{FrameId, SubmapId};
@@ -32,7 +33,7 @@ impl Solution {
     pub fn relatives_to(&self, reference: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Vec<(SubmapId, Relative)> {
         let Some(r) = self.graph.position(reference) else { return Vec::new() };
         let Some(columns) = self.columns_of(&self.row_block(r, &Matrix7::identity())) else { return Vec::new() };
-        let inverse = self.pattern.selected_inverse(&self.factor);
+        let inverse = self.selected_inverse();
         let at_reference = self.rows(&columns, r);
         let anchors = self.graph.nodes().iter().enumerate();
         let one = |(k, &id): (usize, &SubmapId)| {
@@ -74,6 +75,31 @@ impl Solution {
             }
         }
         Some((out + out.transpose()) * 0.5)
+    }
+
+    /// [`Solution::covariance_between`] for two anchors that a factor ties, from the selected inverse instead of solves.
+    pub(super) fn covariance_along(&self, inverse: &SelectedInverse<'_>, a: usize, b: usize) -> Option<Matrix7> {
+        let adjoint = (self.values[b].inverse() * self.values[a]).adjoint();
+        let block = |x: usize, y: usize| {
+            let (rows, columns) = (self.variables(x), self.variables(y));
+            let mut out = Matrix7::zeros();
+            for (r, row) in rows.iter().enumerate() {
+                for (c, column) in columns.iter().enumerate() {
+                    if let (Some(row), Some(column)) = (row, column) {
+                        out[(r, c)] = inverse.get(*row, *column)?;
+                    }
+                }
+            }
+            Some(out)
+        };
+        let cross = block(b, a)? * adjoint.transpose();
+        let joint = block(b, b)? - cross - cross.transpose() + adjoint * block(a, a)? * adjoint.transpose();
+        Some((joint + joint.transpose()) * 0.5)
+    }
+
+    /// The entries of `H⁻¹` in the pattern of its factor.
+    pub(super) fn selected_inverse(&self) -> SelectedInverse<'_> {
+        self.pattern.selected_inverse(&self.factor)
     }
 
     /// The row block A of `δ_b − Ad δ_a` as (scalar, column of A).

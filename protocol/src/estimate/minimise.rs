@@ -4,7 +4,7 @@
 //! (Madsen, Nielsen and Tingleff 2004, §3.2). The elimination order and symbolic factorisation are made once.
 
 use super::solve::SolveError;
-use super::sparse::BlockPattern;
+use super::sparse::{BlockPattern, Factor, Workspace};
 
 /// Stop when a step promises to lower the cost by less than this share of (1 + cost): of a χ², a millionth of a
 /// standard deviation.
@@ -40,6 +40,9 @@ pub(super) trait Objective {
 pub(super) struct Normal {
     pub(super) h: Vec<f64>,
     pub(super) g: Vec<f64>,
+    /// Memory of the damped `H` and its factor.
+    damped: Vec<f64>,
+    space: Workspace,
 }
 
 /// Where the minimisation ended.
@@ -49,6 +52,8 @@ pub(super) struct Minimum<V> {
     pub(super) iterations: usize,
     /// Whether the last step was negligible (otherwise the iterations ran out).
     pub(super) converged: bool,
+    /// Memory of the last normal equations, to be used again.
+    pub(super) normal: Normal,
 }
 
 /// Minimises from `start`.
@@ -101,10 +106,15 @@ pub(super) fn minimise<O: Objective>(
             growth *= 2.0;
         }
     }
-    Ok(Minimum { values: state.values, cost: state.cost, iterations, converged })
+    Ok(Minimum { values: state.values, cost: state.cost, iterations, converged, normal })
 }
 
 impl Normal {
+    /// The factor of `H`.
+    pub(super) fn factorised(mut self, pattern: &BlockPattern) -> Result<Factor, SolveError> {
+        pattern.factorise(self.h, &mut self.space)
+    }
+
     /// `H` and `g` at a point.
     pub(super) fn at<O: Objective>(&mut self, objective: &O, values: &O::Values) {
         self.h.clear();
@@ -115,16 +125,19 @@ impl Normal {
     }
 
     /// Solves `(H + μ diag H) δ = −g`.
-    fn step(&self, pattern: &BlockPattern, damping: f64) -> Result<Step, SolveError> {
-        let mut h = self.h.clone();
+    fn step(&mut self, pattern: &BlockPattern, damping: f64) -> Result<Step, SolveError> {
+        let mut h = core::mem::take(&mut self.damped);
+        h.clear();
+        h.extend_from_slice(&self.h);
         let mut damped = Vec::new();
         if damping > 0.0 {
             damped.extend(pattern.diagonal().map(|at| damping * self.h[at]));
             pattern.diagonal().zip(&damped).for_each(|(at, d)| h[at] += d);
         }
-        let factor = pattern.factorise(h)?;
+        let factor = pattern.factorise(h, &mut self.space)?;
         let mut delta: Vec<f64> = self.g.iter().map(|g| -g).collect();
         pattern.solve(&factor, &mut delta);
+        self.damped = factor.into_values();
         let along_gradient: f64 = delta.iter().zip(&self.g).map(|(x, g)| -x * g).sum();
         let damped: f64 = delta.iter().zip(&damped).map(|(x, d)| d * x * x).sum();
         Ok(Step { delta, decrease: along_gradient + damped })

@@ -7,6 +7,7 @@
 
 use super::graph::{Edge, Label};
 use super::solve::Solution;
+use super::sparse::SelectedInverse;
 use crate::geometry::sim3::{self, Matrix7, Vector7};
 use crate::geometry::{Relative, se3};
 use nalgebra::SMatrix;
@@ -42,9 +43,10 @@ pub(super) struct Drop {
 /// The measurements to leave out before solving again: the worst one (first in canonical order among equals), or all
 /// that fail once `round` has reached the limit.
 pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
+    let inverse = solution.selected_inverse();
     let tested = solution.graph().edges().iter().filter(|e| e.factor.label != Label::Odometry);
     let failing = tested.filter_map(|edge| {
-        let (chi2, dof) = leave_one_out(solution, edge)?;
+        let (chi2, dof) = leave_one_out(solution, &inverse, edge)?;
         let limit = CHI2_999.get(dof.checked_sub(1)?)?;
         (chi2 > *limit).then_some((chi2 / limit, Drop { label: edge.factor.label, chi2 }))
     });
@@ -57,9 +59,9 @@ pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
 }
 
 /// The leave-one-out χ² of a measurement and the number of redundant directions.
-pub(super) fn leave_one_out(solution: &Solution, edge: &Edge) -> Option<(f64, usize)> {
+pub(super) fn leave_one_out(solution: &Solution, inverse: &SelectedInverse<'_>, edge: &Edge) -> Option<(f64, usize)> {
     let residual = edge.residual(solution.values());
-    let predicted = solution.covariance_between(edge.i, edge.j)?;
+    let predicted = solution.covariance_along(inverse, edge.i, edge.j)?;
     match &edge.factor.t_i_j {
         Relative::Metric(p) => {
             let r = residual.fixed_rows::<6>(0).into_owned();

@@ -66,20 +66,46 @@ impl Solution {
     }
 }
 
+/// A minimum of χ² without a factorisation.
+#[derive(Clone, Debug)]
+pub struct ChiSquaredMinimum {
+    /// `t_world_anchor` in the order of [`Graph::nodes`].
+    pub values: Vec<Sim3>,
+    /// Weighted sum of squared residuals.
+    pub chi2: f64,
+    /// Iterations used.
+    pub iterations: usize,
+    /// Whether the last step was negligible.
+    pub converged: bool,
+}
+
+/// As [`solve`], for those who want no covariances: nothing is factorised at the minimum.
+///
+/// # Errors
+/// As [`solve`], but a direction that no measurement determines may pass unseen.
+pub fn minimum(graph: &Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<ChiSquaredMinimum, SolveError> {
+    expect_start(graph, &start)?;
+    let found = minimise(&System::new(graph)?, start, iterations_max)?;
+    let (chi2, iterations, converged) = (found.cost, found.iterations, found.converged);
+    Ok(ChiSquaredMinimum { values: found.values, chi2, iterations, converged })
+}
+
+fn expect_start(graph: &Graph, start: &[Sim3]) -> Result<(), SolveError> {
+    let (want, got) = (graph.nodes().len(), start.len());
+    if want == got { Ok(()) } else { Err(SolveError::Start { want, got }) }
+}
+
 /// Minimises the component's χ² from `start` (one `t_world_anchor` per node, in order; anchors of one frame must have
 /// the same scale).
 ///
 /// # Errors
 /// [`SolveError`]; running out of iterations is no error but `converged = false`.
 pub fn solve(graph: Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<Solution, SolveError> {
-    if start.len() != graph.nodes().len() {
-        return Err(SolveError::Start { want: graph.nodes().len(), got: start.len() });
-    }
+    expect_start(&graph, &start)?;
     let system = System::new(&graph)?;
-    let Minimum { values, cost: chi2, iterations, converged } = minimise(&system, start, iterations_max)?;
-    let mut normal = Normal::default();
+    let Minimum { values, cost: chi2, iterations, converged, mut normal } = minimise(&system, start, iterations_max)?;
     normal.at(&system, &values);
-    let factor = system.pattern.factorise(normal.h)?;
+    let factor = normal.factorised(&system.pattern)?;
     let residuals: usize = graph.edges().iter().map(Edge::dimension).sum();
     let dof = residuals.saturating_sub(system.pattern.scalars());
     let pattern = Arc::new(system.pattern);
@@ -204,8 +230,7 @@ fn add_rigid(
 fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[Slot], normal: &mut Normal) {
     let at = edge.linearise(values);
     let weighted = edge.information * at.residual;
-    let jacobians: Vec<SMatrix<f64, 7, 6>> =
-        parts.iter().map(|(_, part)| columns(*part, &at.by_i, &at.by_j)).collect();
+    let jacobians: Vec<SMatrix<f64, 7, 6>> = parts.iter().map(|(_, part)| columns(*part, &at.by_i, &at.by_j)).collect();
     let mut slots = slots.iter();
     for (p, (start, part)) in parts.iter().enumerate() {
         let gradient = jacobians[p].transpose() * weighted;

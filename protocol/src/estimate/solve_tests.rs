@@ -329,6 +329,6 @@ fn leave_one_out_equals_the_innovation_against_the_map_without_the_factor() {
     let predicted = without.relative(tested.i, tested.j, &BTreeSet::new()).unwrap();
     let want = predicted.disagreement(&tested.t_i_j).distance_squared;
     let edge = with.graph().edges().iter().find(|e| e.factor.label == tested.label).unwrap();
-    let (got, dof) = leave_one_out(&with, edge).unwrap();
+    let (got, dof) = leave_one_out(&with, &with.selected_inverse(), edge).unwrap();
     assert!(dof == 6 && (got / want - 1.0).abs() < 0.02, "{got} {want}");
 }

@@ -5,7 +5,7 @@
 //! spatial ones that hold the plane: their information out of the plane is as large as the largest within it, and its
 //! value does not matter to the estimate, because nothing in the plane pulls out of it.
 
-use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_weights};
+use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_weights, printed_matrix};
 use crate::geometry::so3::So3;
 use crate::geometry::{Se3, se3};
 use nalgebra::{Matrix3, Matrix6, Vector3};
@@ -51,7 +51,9 @@ pub enum Fault {
     #[error("the quaternion has norm {0:.3}, not 1; write it as x y z w of norm 1")]
     Quaternion(f64),
     /// An information matrix that is none.
-    #[error("the information matrix is not positive definite; give directions that are not measured a small positive value")]
+    #[error(
+        "the information matrix is not positive definite; give directions that are not measured a small positive value"
+    )]
     Information,
     /// Both ends are one pose.
     #[error("measures pose {0} against itself; leave the line out")]
@@ -123,12 +125,14 @@ impl Parser {
                 let (ends, numbers) = parsed::<2, 28>(&fields)?;
                 let information = symmetric::<6>(&numbers[7..]);
                 let (kappa, tau) = isotropic_weights(&information).ok_or(Fault::Information)?;
-                self.measurement(ends, pose(&numbers)?, information, (kappa, tau), false)
+                let printed = printed_matrix([numbers[3], numbers[4], numbers[5], numbers[6]]);
+                self.measurement(ends, (pose(&numbers)?, printed), information, (kappa, tau), false)
             }
             "EDGE_SE2" => {
                 let (ends, numbers) = parsed::<2, 9>(&fields)?;
                 let (information, weights) = from_plane(&symmetric::<3>(&numbers[3..])).ok_or(Fault::Information)?;
-                self.measurement(ends, planar_pose(&numbers), information, weights, true)
+                let t_i_j = planar_pose(&numbers);
+                self.measurement(ends, (t_i_j, t_i_j.rotation.matrix()), information, weights, true)
             }
             _ => Err(Fault::Tag(tag.chars().take(40).collect())),
         }
@@ -147,7 +151,7 @@ impl Parser {
     fn measurement(
         &mut self,
         [i, j]: [u64; 2],
-        t_i_j: Se3,
+        (t_i_j, printed): (Se3, Matrix3<f64>),
         information: Matrix6<f64>,
         (kappa, tau): (f64, f64),
         planar: bool,
@@ -166,7 +170,7 @@ impl Parser {
         self.graph.poses.entry(i).or_default();
         self.graph.poses.entry(j).or_default();
         let line = self.line;
-        self.graph.measurements.push(Measurement { i, j, t_i_j, information, kappa, tau, line });
+        self.graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
         Ok(())
     }
 
@@ -230,10 +234,8 @@ fn from_plane(planar: &Matrix3<f64>) -> Option<(Matrix6<f64>, (f64, f64))> {
     planar.cholesky()?;
     let trace = planar.fixed_view::<2, 2>(0, 0).into_owned().try_inverse()?.trace();
     let (stiff_t, stiff_r) = (planar[(0, 0)].max(planar[(1, 1)]), planar[(2, 2)]);
-    let mut out = Matrix6::from_diagonal(&se3::join(
-        &Vector3::new(0.0, 0.0, stiff_t),
-        &Vector3::new(stiff_r, stiff_r, 0.0),
-    ));
+    let mut out =
+        Matrix6::from_diagonal(&se3::join(&Vector3::new(0.0, 0.0, stiff_t), &Vector3::new(stiff_r, stiff_r, 0.0)));
     let places = [0, 1, 5];
     for (r, &row) in places.iter().enumerate() {
         for (c, &column) in places.iter().enumerate() {

@@ -3,7 +3,7 @@
 //! Columns, by name: `robot_src, pose_src, robot_dst, pose_dst, qx, qy, qz, qw, tx, ty, tz, kappa, tau`, and optionally
 //! `is_known_inlier, weight`. A pose becomes the g2o id with the robot's letter in the top byte, as GTSAM's symbols are.
 
-use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph};
+use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, printed_matrix};
 use crate::geometry::Se3;
 use nalgebra::Matrix6;
 use std::collections::{BTreeMap, BTreeSet};
@@ -105,7 +105,18 @@ impl Importer {
         let fields: Vec<&str> = text.split(',').map(str::trim).collect();
         if self.columns.is_empty() {
             const WANTED: [&str; 13] = [
-                "robot_src", "pose_src", "robot_dst", "pose_dst", "qx", "qy", "qz", "qw", "tx", "ty", "tz", "kappa",
+                "robot_src",
+                "pose_src",
+                "robot_dst",
+                "pose_dst",
+                "qx",
+                "qy",
+                "qz",
+                "qw",
+                "tx",
+                "ty",
+                "tz",
+                "kappa",
                 "tau",
             ];
             if let Some(missing) = WANTED.into_iter().find(|name| !fields.contains(name)) {
@@ -131,7 +142,8 @@ impl Importer {
             known: row.get("is_known_inlier").is_some_and(|&text| text == "1"),
             weight: if row.contains_key("weight") { number("weight")? } else { 1.0 },
         };
-        self.add(Measurement { i, j, t_i_j, information: isotropic(kappa, tau), kappa, tau, line: self.line }, recorded)
+        let (printed, information, line) = (printed_matrix(xyzw), isotropic(kappa, tau), self.line);
+        self.add(Measurement { i, j, t_i_j, printed, information, kappa, tau, line }, recorded)
     }
 
     fn add(&mut self, m: Measurement, recorded: Recorded) -> Result<(), KimeraFault> {

@@ -5,6 +5,7 @@
 
 pub mod g2o;
 pub mod kimera;
+pub mod robust;
 pub mod solve;
 
 #[cfg(test)]
@@ -13,7 +14,7 @@ mod tests;
 use super::chordal::{ChordalEdge, ChordalGraph};
 use super::graph::Disjoint;
 use crate::geometry::{Covariance, Se3};
-use nalgebra::Matrix6;
+use nalgebra::{Matrix3, Matrix6};
 use std::collections::BTreeMap;
 
 /// Poses a graph may have.
@@ -30,6 +31,8 @@ pub struct Measurement {
     pub j: u64,
     /// `t_i_j`.
     pub t_i_j: Se3,
+    /// Its rotation as printed, which rounding may have made only nearly one (see [`ChordalEdge::r_i_j`]).
+    pub printed: Matrix3<f64>,
     /// Information of its local perturbation (ρ, φ); symmetric positive definite.
     pub information: Matrix6<f64>,
     /// SE-Sync's weight of the rotation.
@@ -76,7 +79,8 @@ impl PoseGraph {
         let edge = |m: &Measurement| ChordalEdge {
             i: place[&m.i],
             j: place[&m.j],
-            t_i_j: m.t_i_j,
+            r_i_j: m.printed,
+            p_i_j: m.t_i_j.translation,
             kappa: m.kappa,
             tau: m.tau,
         };
@@ -103,6 +107,21 @@ pub fn isotropic_weights(information: &Matrix6<f64>) -> Option<(f64, f64)> {
     let of_rotation = information.fixed_view::<3, 3>(3, 3).into_owned().try_inverse()?.trace();
     let (kappa, tau) = (1.5 / of_rotation, 3.0 / of_translation);
     (kappa.is_finite() && tau.is_finite() && kappa > 0.0 && tau > 0.0).then_some((kappa, tau))
+}
+
+/// The matrix of a quaternion (x, y, z, w) by the formula for unit ones, whatever its norm.
+fn printed_matrix([x, y, z, w]: [f64; 4]) -> Matrix3<f64> {
+    Matrix3::new(
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - z * w),
+        2.0 * (x * z + y * w),
+        2.0 * (x * y + z * w),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - x * w),
+        2.0 * (x * z - y * w),
+        2.0 * (y * z + x * w),
+        1.0 - 2.0 * (x * x + y * y),
+    )
 }
 
 /// The covariance of an information matrix; `None` if that is not symmetric positive definite and finite.

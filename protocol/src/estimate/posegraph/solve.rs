@@ -3,7 +3,7 @@
 use super::{PoseGraph, covariance_of};
 use crate::estimate::certificate::Certificate;
 use crate::estimate::graph::{Factor, Graph, GraphError, Label};
-use crate::estimate::solve::{Solution, SolveError, solve};
+use crate::estimate::solve::{Solution, SolveError, minimum, solve};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{FrameId, RobotId, SubmapId};
 use std::collections::{BTreeMap, BTreeSet};
@@ -48,6 +48,19 @@ pub struct ChordalOutcome {
     pub converged: bool,
     /// Whether that minimum is the global one.
     pub certificate: Certificate,
+}
+
+/// A minimum of χ², without what covariances need.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Minimised {
+    /// `t_world_pose` in the order of [`PoseGraph::poses`]; the first is the identity, or as given.
+    pub values: Vec<Se3>,
+    /// Weighted sum of squared residuals.
+    pub chi2: f64,
+    /// Iterations used.
+    pub iterations: usize,
+    /// Whether the last step was negligible.
+    pub converged: bool,
 }
 
 /// A solved graph.
@@ -96,7 +109,24 @@ impl PoseGraph {
     ///
     /// # Errors
     /// [`PoseGraphError`] if the graph is not connected or cannot be solved.
+    pub fn minimise(&self, start: &[Se3], iterations_max: usize) -> Result<Minimised, PoseGraphError> {
+        let found = minimum(&self.graph()?, start.iter().map(Sim3::from_se3).collect(), iterations_max)?;
+        let values = found.values.iter().map(Sim3::to_se3).collect();
+        Ok(Minimised { values, chi2: found.chi2, iterations: found.iterations, converged: found.converged })
+    }
+
+    /// The same, with the factorisation that covariances are drawn from.
+    ///
+    /// # Errors
+    /// As [`PoseGraph::minimise`].
     pub fn solve(&self, start: &[Se3], iterations_max: usize) -> Result<Solved, PoseGraphError> {
+        let solution = solve(self.graph()?, start.iter().map(Sim3::from_se3).collect(), iterations_max)?;
+        let values = solution.values().iter().map(Sim3::to_se3).collect();
+        Ok(Solved { ids: self.poses.keys().copied().collect(), values, solution })
+    }
+
+    /// The one component as the estimate's own graph.
+    fn graph(&self) -> Result<Graph, PoseGraphError> {
         let place: BTreeMap<u64, SubmapId> = self.poses.keys().copied().zip((0..).map(node)).collect();
         let factor = |m: &super::Measurement| {
             // An information that is not positive definite does not pass the parsers.
@@ -107,13 +137,10 @@ impl PoseGraph {
         let factors = self.measurements.iter().map(factor).collect();
         let nodes: BTreeSet<SubmapId> = place.values().copied().collect();
         let mut graphs = Graph::components(&nodes, &BTreeSet::new(), factors)?;
-        let graph = match (graphs.pop(), graphs.len()) {
-            (Some(graph), 0) => graph,
-            (_, more) => return Err(PoseGraphError::Parts(more + 1)),
-        };
-        let solution = solve(graph, start.iter().map(Sim3::from_se3).collect(), iterations_max)?;
-        let values = solution.values().iter().map(Sim3::to_se3).collect();
-        Ok(Solved { ids: self.poses.keys().copied().collect(), values, solution })
+        match (graphs.pop(), graphs.len()) {
+            (Some(graph), 0) => Ok(graph),
+            (_, more) => Err(PoseGraphError::Parts(more + 1)),
+        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{LltError, LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
+use faer::linalg::matmul::matmul;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{Accum, MatMut, MatRef, Par};
@@ -51,31 +52,27 @@ impl Panel<'_> {
 }
 
 /// From the panel of a factor, `L` and `B`, and `z_below`, the dense square of `H⁻¹` at the rows below: the panel of
-/// `H⁻¹`, whose rows below are `−Z_below W` with `W = B L⁻¹` and whose square is `L⁻ᵀ L⁻¹ − Wᵀ (−Z_below W)`.
-pub(super) fn invert(panel: &Panel<'_>, z_below: &[f64], out: &mut [f64]) {
+/// `H⁻¹`, whose rows below are `−Z_below W` with `W = B L⁻¹` and whose square is `L⁻ᵀ L⁻¹ − Wᵀ (−Z_below W)`. Leaves `W`
+/// and `L⁻¹` in `panel`.
+pub(super) fn invert(panel: &mut Panel<'_>, z_below: &[f64], out: &mut [f64]) {
     let (height, columns) = (panel.height, panel.columns);
     let depth = height - columns;
-    let factor = MatRef::from_column_major_slice(panel.values, height, columns);
-    let (square, below) = factor.split_at_row(columns);
+    let factor = MatMut::from_column_major_slice_mut(panel.values, height, columns);
+    let (mut square, mut w) = factor.split_at_row_mut(columns);
     let out = MatMut::from_column_major_slice_mut(out, height, columns);
     let (mut z_square, mut z_rows) = out.split_at_row_mut(columns);
-    // W = B L⁻¹ solves Wᵀ: Lᵀ Wᵀ = Bᵀ.
-    let mut w = faer::Mat::<f64>::from_fn(depth, columns, |r, c| below[(r, c)]);
-    solve_upper_triangular_in_place(square.transpose(), w.as_mut().transpose_mut(), Par::Seq);
+    // W = B L⁻¹ solves Lᵀ Wᵀ = Bᵀ.
+    solve_upper_triangular_in_place(square.as_ref().transpose(), w.as_mut().transpose_mut(), Par::Seq);
     let z_below = MatRef::from_column_major_slice(z_below, depth, depth);
-    faer::linalg::matmul::matmul(z_rows.as_mut(), Accum::Replace, z_below, w.as_ref(), -1.0, Par::Seq);
-    // L⁻¹, then L⁻ᵀ L⁻¹.
-    let mut inverse = faer::Mat::<f64>::identity(columns, columns);
-    solve_lower_triangular_in_place(square, inverse.as_mut(), Par::Seq);
-    faer::linalg::matmul::matmul(
-        z_square.as_mut(),
-        Accum::Replace,
-        inverse.as_ref().transpose(),
-        inverse.as_ref(),
-        1.0,
-        Par::Seq,
-    );
-    faer::linalg::matmul::matmul(z_square, Accum::Add, w.as_ref().transpose(), z_rows.as_ref(), -1.0, Par::Seq);
+    matmul(z_rows.as_mut(), Accum::Replace, z_below, w.as_ref(), -1.0, Par::Seq);
+    // L⁻¹ by way of the output, then L⁻ᵀ L⁻¹.
+    z_square.fill(0.0);
+    z_square.as_mut().diagonal_mut().fill(1.0);
+    solve_lower_triangular_in_place(square.as_ref(), z_square.as_mut(), Par::Seq);
+    square.copy_from(&z_square);
+    let inverse = square.as_ref();
+    matmul(z_square.as_mut(), Accum::Replace, inverse.transpose(), inverse, 1.0, Par::Seq);
+    matmul(z_square, Accum::Add, w.as_ref().transpose(), z_rows.as_ref(), -1.0, Par::Seq);
 }
 
 /// Working memory that grows to what the largest front needs.

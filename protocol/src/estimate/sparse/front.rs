@@ -10,28 +10,50 @@ pub(in crate::estimate) struct Factor {
     pub(super) values: Vec<f64>,
 }
 
+/// Memory that factorisations share: fresh pages cost more than the arithmetic of small fronts.
+#[derive(Default)]
+pub(in crate::estimate) struct Workspace {
+    /// Updates that their parents have not taken up yet, the latest last.
+    updates: Vec<f64>,
+    scratch: Scratch,
+}
+
+impl Factor {
+    /// Gives the memory back, for the next `H`.
+    pub(in crate::estimate) fn into_values(self) -> Vec<f64> {
+        self.values
+    }
+}
+
 impl BlockPattern {
     /// Factorises `H = L Lᵀ`.
     ///
     /// # Errors
     /// [`SolveError::Underconstrained`] with the variable at which a pivot is not positive.
-    pub(in crate::estimate) fn factorise(&self, h: Vec<f64>) -> Result<Factor, SolveError> {
+    pub(in crate::estimate) fn factorise(&self, h: Vec<f64>, space: &mut Workspace) -> Result<Factor, SolveError> {
         let mut values = h;
-        let mut updates: Vec<Vec<f64>> = vec![Vec::new(); self.fronts.len()];
-        let mut scratch = Scratch::default();
-        for (k, front) in self.fronts.iter().enumerate() {
-            let mut update = vec![0.0; front.depth() * front.depth()];
+        let Workspace { updates, scratch } = space;
+        updates.clear();
+        for front in &self.fronts {
+            // In postorder the children's updates lie on top, one after the other.
+            let given: usize = front.children.iter().map(|&child| self.fronts[child].depth().pow(2)).sum();
+            let (base, size) = (updates.len() - given, front.depth().pow(2));
+            updates.resize(base + given + size, 0.0);
+            let (children, update) = updates[base..].split_at_mut(given);
             let panel = &mut values[front.offset..front.offset + front.height * front.pivots.len()];
-            for &child in &front.children {
-                let given = core::mem::take(&mut updates[child]);
-                assemble(&self.fronts[child], &given, front, panel, &mut update);
+            let mut rest = &*children;
+            for child in front.children.iter().map(|&child| &self.fronts[child]) {
+                let (of_child, others) = rest.split_at(child.depth().pow(2));
+                assemble(child, of_child, front, panel, update);
+                rest = others;
             }
             let mut panel = Panel { values: panel, height: front.height, columns: front.pivots.len() };
-            panel.eliminate(&mut scratch).map_err(|index| SolveError::Underconstrained {
+            panel.eliminate(scratch).map_err(|index| SolveError::Underconstrained {
                 variable: self.variable_of(front.pivots.start + index),
             })?;
-            panel.subtract_square(&mut update);
-            updates[k] = update;
+            panel.subtract_square(update);
+            updates.copy_within(base + given.., base);
+            updates.truncate(base + size);
         }
         if values.iter().all(|x| x.is_finite()) { Ok(Factor { values }) } else { Err(SolveError::NotFinite) }
     }
@@ -87,11 +109,21 @@ impl Front {
         let own = &mut x[self.pivots.clone()];
         for (k, column) in self.panel(values).enumerate().rev() {
             let (square, below) = column.split_at(own.len());
-            let known: f64 = own[k + 1..].iter().zip(&square[k + 1..]).map(|(x, l)| x * l).sum();
-            let known = known + below.iter().zip(&*gathered).map(|(l, x)| l * x).sum::<f64>();
+            let known = dot(&own[k + 1..], &square[k + 1..]) + dot(below, gathered);
             own[k] = (own[k] - known) / square[k];
         }
     }
+}
+
+/// The inner product, in eight sums side by side: a single one would wait for itself.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut sums = [0.0; 8];
+    let (a, b) = (a.chunks_exact(8), b[..a.len()].chunks_exact(8));
+    let rest: f64 = a.remainder().iter().zip(b.remainder()).map(|(x, y)| x * y).sum();
+    for (a, b) in a.zip(b) {
+        sums.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (x, y))| *sum += x * y);
+    }
+    sums.iter().sum::<f64>() + rest
 }
 
 /// Adds a child's update to its parent: what falls on the parent's pivots to the panel, the rest to the parent's own

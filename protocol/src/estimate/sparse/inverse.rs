@@ -22,8 +22,9 @@ impl BlockPattern {
             self.gather(front, &values, &mut z_below);
             out.clear();
             out.resize(range.len(), 0.0);
-            let panel = Panel { values: &mut values[range.clone()], height: front.height, columns: front.pivots.len() };
-            dense::invert(&panel, &z_below, &mut out);
+            let mut panel =
+                Panel { values: &mut values[range.clone()], height: front.height, columns: front.pivots.len() };
+            dense::invert(&mut panel, &z_below, &mut out);
             values[range].copy_from_slice(&out);
         }
         SelectedInverse { pattern: self, values }

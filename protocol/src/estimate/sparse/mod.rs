@@ -13,8 +13,9 @@ mod order;
 #[cfg(test)]
 mod tests;
 
-pub(super) use front::Factor;
 use super::solve::SolveError;
+pub(super) use front::{Factor, Workspace};
+pub(super) use inverse::SelectedInverse;
 use order::Elimination;
 use std::ops::Range;
 

@@ -12,7 +12,7 @@ use std::ops::Range;
 
 /// Supernodes of up to so many scalars are merged if at most this share of the result is zeros; the last entry bounds
 /// all larger ones.
-const ZEROS_MAX: [(usize, f64); 3] = [(18, 0.6), (60, 0.2), (usize::MAX, 0.04)];
+const ZEROS_MAX: [(usize, f64); 3] = [(18, 0.4), (36, 0.1), (usize::MAX, 0.01)];
 
 /// Variables that are eliminated together.
 #[derive(Debug)]

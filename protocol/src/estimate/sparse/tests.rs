@@ -46,7 +46,7 @@ proptest! {
     #[test]
     fn solves_and_inverts_like_dense_algebra(seed: u64, variables in 1usize..40, couplings in 0usize..60) {
         let case = Case::new(seed, variables, couplings);
-        let factor = case.pattern.factorise(case.values.clone()).unwrap();
+        let factor = case.pattern.factorise(case.values.clone(), &mut Workspace::default()).unwrap();
         let inverse = case.dense.clone().try_inverse().unwrap();
         let n = case.pattern.scalars();
         let b = DVector::from_fn(2 * n, |r, _| (r as f64).sin());
@@ -84,9 +84,12 @@ fn a_pivot_that_is_not_positive_names_its_variable() {
         let mut values = case.values.clone();
         let slot = case.pattern.slot(variable, variable);
         values[slot.at + (case.sizes[variable] - 1) * (slot.stride + 1)] = -1e9;
-        assert_eq!(case.pattern.factorise(values.clone()).unwrap_err(), SolveError::Underconstrained { variable });
+        assert_eq!(
+            case.pattern.factorise(values.clone(), &mut Workspace::default()).unwrap_err(),
+            SolveError::Underconstrained { variable }
+        );
     }
     let mut values = case.values.clone();
     values[case.pattern.slot(5, 5).at] = f64::NAN;
-    assert!(case.pattern.factorise(values.clone()).is_err());
+    assert!(case.pattern.factorise(values.clone(), &mut Workspace::default()).is_err());
 }

@@ -13,11 +13,8 @@ pub(super) struct Peer {
     /// Twice its error: χ².
     pub(super) chi2: f64,
     pub(super) solve_s: f64,
-    /// All covariances, extrapolated from `marginals_of` poses.
+    /// All covariances, extrapolated from some where it takes long.
     pub(super) marginals_s: f64,
-    pub(super) marginals_of: usize,
-    /// Sum of the variances of those poses, relative to the first.
-    pub(super) trace: f64,
 }
 
 /// Solves `file` with GTSAM.

@@ -55,7 +55,7 @@ pub(super) fn table(rows: &[Row]) -> String {
     let _ = writeln!(
         text,
         "\n{:<40} {:>16} {:>5} {:>9} {:>16} {:>16} {:>9} {:>7} {:>10} {:>10} {:>9}",
-        "χ²", "χ²", "iter.", "cpu ms", "from certified", "GTSAM χ²", "ms", "ratio", "marginals", "GTSAM ms", "ratio"
+        "χ²", "χ²", "iter.", "cpu ms", "from certified", "GTSAM χ²", "ms", "ratio", "marg. ms", "GTSAM ms", "ratio"
     );
     for row in rows {
         let m = &row.measured;
