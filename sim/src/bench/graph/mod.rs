@@ -38,13 +38,20 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
     let bar = progress_bar(sources.len() as u64, "graphs")?;
     let mut rows = Vec::new();
     for source in &sources {
-        let graph = source.read()?;
+        let mut graph = source.read()?;
+        let isotropic = !graph.has_covariances();
+        if isotropic {
+            graph = graph.isotropic();
+        }
         let measured = measure::measure(&graph, options.repeats)?;
         let peer = match &options.peer_python {
-            Some(python) if source.files.len() == 1 => Some(peer::measure(python, &source.files[0], options.repeats)?),
+            Some(python) if source.files.len() == 1 && !isotropic => {
+                Some(peer::measure(python, &source.files[0], options.repeats)?)
+            }
             _ => None,
         };
-        rows.push(table::Row { name: source.name.clone(), optimum: optima.get(&source.name).copied(), measured, peer });
+        let (name, optimum) = (source.name.clone(), optima.get(&source.name).copied());
+        rows.push(table::Row { name, optimum, isotropic, measured, peer });
         bar.inc(1);
     }
     bar.finish_and_clear();
