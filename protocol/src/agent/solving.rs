@@ -4,8 +4,8 @@ use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{Job, SolveJob, Solved};
 use super::knowledge::Question;
-use crate::geometry::PoseWithCovariance;
-use crate::ids::{EntryId, FrameId, Hash};
+use crate::geometry::{PoseWithCovariance, Relative};
+use crate::ids::{EntryId, FrameId, Hash, SubmapId};
 use crate::time::Instant;
 use crate::wire::fact::Fact;
 use core::time::Duration;
@@ -15,12 +15,15 @@ use std::collections::{BTreeMap, BTreeSet};
 #[derive(Default)]
 pub(super) struct MapState {
     pub(super) solved: Solved,
+    /// Our frame when the estimate was posed, in which its views are given. A new epoch has another.
+    seen_from: Option<FrameId>,
     /// Frames that the estimate passed over because nothing ties them to anything, and how many anchors each has.
     pub(super) alone: BTreeMap<FrameId, usize>,
     /// Facts came in since the last problem was posed.
     pub(super) dirty: bool,
     pub(super) solving: Option<JobId>,
     posed_digest: Hash,
+    posed_from: Option<FrameId>,
     posed_alone: BTreeMap<FrameId, usize>,
     /// Digest of the set of facts that the estimate is a function of.
     pub(super) digest: Hash,
@@ -39,7 +42,7 @@ impl Agent {
             let own = self.me.frame;
             let Question { problem, alone } = self.knowledge.question(own, |entry| self.odometry(entry));
             let job = SolveJob { problem, config, own };
-            self.map.posed_alone = alone;
+            (self.map.posed_from, self.map.posed_alone) = (Some(own), alone);
             self.map.dirty = false;
             self.map.posed_digest = self.replica.digest();
             self.map.next_solve = self.now.after(Duration::from_secs_f64(self.config.estimate.interval_secs));
@@ -52,6 +55,7 @@ impl Agent {
             return;
         }
         self.map.digest = self.map.posed_digest;
+        self.map.seen_from = self.map.posed_from;
         self.map.alone = core::mem::take(&mut self.map.posed_alone);
         self.map.solved = solved;
         let merged = self.frames_merged_with_ours();
@@ -71,6 +75,20 @@ impl Agent {
         let Some(ours) = self.map.solved.frames.get(&own).map(|placed| placed.with) else { return BTreeSet::new() };
         let together = self.map.solved.frames.iter().filter(|(frame, placed)| **frame != own && placed.with == ours);
         together.map(|(frame, _)| *frame).collect()
+    }
+
+    /// `t_own_frame`, if the estimate says so of our present frame.
+    pub(super) fn t_own_frame(&self, frame: FrameId) -> Option<Relative> {
+        self.solved_for_own()?.frames.get(&frame)?.t_own_frame
+    }
+
+    /// `t_own_anchor`, likewise.
+    pub(super) fn t_own_anchor(&self, submap: SubmapId) -> Option<&Relative> {
+        self.solved_for_own()?.anchors.get(&submap)
+    }
+
+    fn solved_for_own(&self) -> Option<&Solved> {
+        (self.map.seen_from == Some(self.me.frame)).then_some(&self.map.solved)
     }
 
     fn odometry(&self, entry: EntryId) -> Option<PoseWithCovariance> {

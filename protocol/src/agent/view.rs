@@ -101,10 +101,6 @@ impl Agent {
         with.into_iter().filter_map(|(frame, with)| Some((frame, *numbers.get(&with)?))).collect()
     }
 
-    fn t_own_frame(&self, frame: FrameId) -> Option<Relative> {
-        self.map.solved.frames.get(&frame)?.t_own_frame
-    }
-
     fn pair_views(&self) -> Vec<PairView> {
         let mut proposed: BTreeMap<(FrameId, FrameId), u64> = BTreeMap::new();
         for (_, fact) in self.knowledge.alignments() {
@@ -147,7 +143,7 @@ impl Agent {
         age_secs: f64,
         stamp_secs: f64,
     ) -> RobotView {
-        let t_own_anchor = self.map.solved.anchors.get(&anchor);
+        let t_own_anchor = self.t_own_anchor(anchor);
         let t_own_body = t_own_anchor.map(|t| t.compose(&Relative::Metric(*t_anchor_body)));
         RobotView {
             robot: self.robot_name(robot),
@@ -173,7 +169,7 @@ impl Agent {
                 index: id.index,
                 stamps_secs: fact.stamps.map(crate::time::Stamp::as_secs_f64),
                 t_frame_anchor: PoseView::from(&t_frame_anchor),
-                t_own_anchor: self.map.solved.anchors.get(&id).map(RelationView::from),
+                t_own_anchor: self.t_own_anchor(id).map(RelationView::from),
             });
         }
         MapView { submaps }
