@@ -236,9 +236,10 @@ fn reasons(solved: &RobustSolved) -> Vec<String> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     for verdict in &solved.verdicts {
         if let Verdict::Unused(reason) = verdict {
-            // What stands in brackets is each one's own number.
+            // From the first number or bracket on, the text is each one's own.
             let text = reason.to_string();
-            *counts.entry(text.split(" (").next().unwrap_or_default().to_owned()).or_default() += 1;
+            let common = text.split(|c: char| c == '(' || c.is_ascii_digit()).next().unwrap_or_default();
+            *counts.entry(common.trim_end().to_owned()).or_default() += 1;
         }
     }
     counts.into_iter().map(|(reason, n)| format!("  {n} left out: {reason}")).collect()

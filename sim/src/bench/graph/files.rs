@@ -13,21 +13,52 @@ pub(super) struct Source {
     /// Its name in optima.csv.
     pub(super) name: String,
     pub(super) files: Vec<PathBuf>,
+    /// Kollagen keeps closures between robots in a file of their own, and numbers each robot's poses from 0.
+    closures: Option<PathBuf>,
 }
 
 impl Source {
     /// Reads it.
     pub(super) fn read(&self) -> anyhow::Result<PoseGraph> {
         let mut parser = Parser::default();
-        for path in &self.files {
-            let place = || path.display().to_string();
-            parser.begin();
-            for line in BufReader::new(File::open(path).with_context(place)?).lines() {
-                parser.line(&line.with_context(place)?).with_context(place)?;
-            }
+        for (robot, path) in (0..).zip(&self.files) {
+            let own = |line: String| if self.closures.is_some() { lettered(&line, robot) } else { line };
+            read_into(&mut parser, path, own)?;
+        }
+        if let Some(path) = &self.closures {
+            read_into(&mut parser, path, |line| closure(&line))?;
         }
         Ok(parser.finish())
     }
+}
+
+fn read_into(parser: &mut Parser, path: &Path, mend: impl Fn(String) -> String) -> anyhow::Result<()> {
+    let place = || path.display().to_string();
+    parser.begin();
+    for line in BufReader::new(File::open(path).with_context(place)?).lines() {
+        parser.line(&mend(line.with_context(place)?)).with_context(place)?;
+    }
+    Ok(())
+}
+
+/// The id of a robot's pose as GTSAM's symbols have it; what is no number stays, for the parser to refuse.
+fn symbol(robot: u64, pose: &str) -> String {
+    pose.parse::<u64>().map_or_else(|_| pose.to_owned(), |k| (((u64::from(b'a') + robot) << 56) | k).to_string())
+}
+
+/// A g2o line whose ids are given the robot's letter.
+fn lettered(line: &str, robot: u64) -> String {
+    let ids = if line.starts_with("EDGE") { 2 } else { 1 };
+    let word = |(k, word): (usize, &str)| if (1..=ids).contains(&k) { symbol(robot, word) } else { word.to_owned() };
+    line.split_whitespace().enumerate().map(word).collect::<Vec<_>>().join(" ")
+}
+
+/// `robot robot i j measurement information` as a g2o line; robots count from 1.
+fn closure(line: &str) -> String {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let [a, b, i, j, rest @ ..] = words.as_slice() else { return line.to_owned() };
+    let robot = |text: &str| text.parse::<u64>().unwrap_or(1).saturating_sub(1);
+    format!("EDGE_SE3:QUAT {} {} {}", symbol(robot(a), i), symbol(robot(b), j), rest.join(" "))
 }
 
 /// SE-Sync's objective by graph, from `optima.csv` in the folder; empty if there is none.
@@ -52,6 +83,16 @@ pub(super) fn find(root: &Path, optima: &BTreeMap<String, f64>, filter: &str) ->
     let mut folders = vec![root.to_path_buf()];
     while let Some(folder) = folders.pop() {
         let mut files = Vec::new();
+        let closures = folder.join("inter_agent_lc.dat");
+        if closures.is_file() {
+            let graph = |path: PathBuf| path.join("posegraph.g2o");
+            let robots = std::fs::read_dir(&folder)?.filter_map(|entry| Some(graph(entry.ok()?.path())));
+            let mut files: Vec<PathBuf> = robots.filter(|path| path.is_file()).collect();
+            files.sort();
+            let name = folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+            found.push(Source { name, files, closures: Some(closures) });
+            continue;
+        }
         for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
             let path = entry?.path();
             if path.is_dir() {
@@ -65,11 +106,12 @@ pub(super) fn find(root: &Path, optima: &BTreeMap<String, f64>, filter: &str) ->
         let name = relative.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_");
         if optima.contains_key(&name) {
             let full = files.iter().find(|f| f.file_stem().is_some_and(|stem| stem == "fullGraph")).cloned();
-            found.push(Source { name, files: full.map_or(files, |full| vec![full]) });
+            found.push(Source { name, files: full.map_or(files, |full| vec![full]), closures: None });
         } else {
             let single = |path: PathBuf| Source {
                 name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
                 files: vec![path],
+                closures: None,
             };
             found.extend(files.into_iter().map(single).filter(|s| optima.is_empty() || optima.contains_key(&s.name)));
         }

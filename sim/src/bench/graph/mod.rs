@@ -3,6 +3,7 @@
 mod files;
 mod measure;
 mod peer;
+mod spoil;
 mod table;
 
 use crate::bar::progress_bar;
@@ -23,6 +24,12 @@ pub struct GraphBench {
     /// Measure GTSAM on the same graphs, in this Python interpreter
     #[arg(long, value_name = "PYTHON")]
     pub peer_python: Option<PathBuf>,
+    /// Replace this share of the closures between robots by random ones, %, and solve robustly instead
+    #[arg(long, value_name = "PERCENT", conflicts_with = "peer_python", value_parser = clap::value_parser!(u32).range(0..=99))]
+    pub spoil: Option<u32>,
+    /// The seed that the random closures are drawn from
+    #[arg(long, default_value_t = 1, requires = "spoil")]
+    pub seed: u64,
     /// Solves of each kind; the fastest counts, for us and for the peer
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=20))]
     pub repeats: u8,
@@ -36,6 +43,16 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
     let optima = files::optima(&options.data)?;
     let sources = files::find(&options.data, &optima, &options.filter)?;
     let bar = progress_bar(sources.len() as u64, "graphs")?;
+    if let Some(percent) = options.spoil {
+        let mut rows = Vec::new();
+        for source in &sources {
+            rows.extend(spoil::measure(source, percent, options.seed)?);
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        write!(std::io::stdout().lock(), "{}", spoil::table(percent, options.seed, &rows))?;
+        return Ok(rows.iter().all(spoil::Spoiled::is_good));
+    }
     let mut rows = Vec::new();
     for source in &sources {
         let mut graph = source.read()?;
