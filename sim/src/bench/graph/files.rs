@@ -13,13 +13,29 @@ pub(super) struct Source {
     /// Its name in optima.csv.
     pub(super) name: String,
     pub(super) files: Vec<PathBuf>,
+    /// The whole graph in one file, where there is one; its poses may not tell their robots.
+    full: Option<PathBuf>,
     /// Kollagen keeps closures between robots in a file of their own, and numbers each robot's poses from 0.
     closures: Option<PathBuf>,
 }
 
 impl Source {
-    /// Reads it.
+    /// The one file that holds it all, if there is one.
+    pub(super) fn one_file(&self) -> Option<&Path> {
+        let only = || self.files.first().filter(|_| self.files.len() == 1);
+        self.full.as_ref().or_else(only).map(PathBuf::as_path)
+    }
+
+    /// Reads it, from one file where there is one.
     pub(super) fn read(&self) -> anyhow::Result<PoseGraph> {
+        let Some(path) = self.one_file() else { return self.read_robots() };
+        let mut parser = Parser::default();
+        read_into(&mut parser, path, |line| line)?;
+        Ok(parser.finish())
+    }
+
+    /// Reads all robots' files.
+    pub(super) fn read_robots(&self) -> anyhow::Result<PoseGraph> {
         let mut parser = Parser::default();
         for (robot, path) in (0..).zip(&self.files) {
             let own = |line: String| if self.closures.is_some() { lettered(&line, robot) } else { line };
@@ -53,10 +69,10 @@ fn lettered(line: &str, robot: u64) -> String {
     line.split_whitespace().enumerate().map(word).collect::<Vec<_>>().join(" ")
 }
 
-/// `robot robot i j measurement information` as a g2o line; robots count from 1.
+/// `robot i robot j measurement information` as a g2o line; robots count from 1.
 fn closure(line: &str) -> String {
     let words: Vec<&str> = line.split_whitespace().collect();
-    let [a, b, i, j, rest @ ..] = words.as_slice() else { return line.to_owned() };
+    let [a, i, b, j, rest @ ..] = words.as_slice() else { return line.to_owned() };
     let robot = |text: &str| text.parse::<u64>().unwrap_or(1).saturating_sub(1);
     format!("EDGE_SE3:QUAT {} {} {}", symbol(robot(a), i), symbol(robot(b), j), rest.join(" "))
 }
@@ -90,7 +106,7 @@ pub(super) fn find(root: &Path, optima: &BTreeMap<String, f64>, filter: &str) ->
             let mut files: Vec<PathBuf> = robots.filter(|path| path.is_file()).collect();
             files.sort();
             let name = folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-            found.push(Source { name, files, closures: Some(closures) });
+            found.push(Source { name, files, full: None, closures: Some(closures) });
             continue;
         }
         for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
@@ -103,14 +119,16 @@ pub(super) fn find(root: &Path, optima: &BTreeMap<String, f64>, filter: &str) ->
         }
         files.sort();
         let relative = folder.strip_prefix(root).unwrap_or(&folder);
-        let name = relative.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_");
+        let name = relative.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_") + ".g2o";
         if optima.contains_key(&name) {
-            let full = files.iter().find(|f| f.file_stem().is_some_and(|stem| stem == "fullGraph")).cloned();
-            found.push(Source { name, files: full.map_or(files, |full| vec![full]), closures: None });
+            let is_full = |f: &PathBuf| f.file_stem().is_some_and(|stem| stem == "fullGraph");
+            let (full, files) = files.into_iter().partition::<Vec<_>, _>(is_full);
+            found.push(Source { name, files, full: full.into_iter().next(), closures: None });
         } else {
             let single = |path: PathBuf| Source {
                 name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
                 files: vec![path],
+                full: None,
                 closures: None,
             };
             found.extend(files.into_iter().map(single).filter(|s| optima.is_empty() || optima.contains_key(&s.name)));

@@ -61,11 +61,9 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
             graph = graph.isotropic();
         }
         let measured = measure::measure(&graph, options.repeats)?;
-        let peer = match &options.peer_python {
-            Some(python) if source.files.len() == 1 && !isotropic => {
-                Some(peer::measure(python, &source.files[0], options.repeats)?)
-            }
-            _ => None,
+        let peer = match options.peer_python.as_deref().zip(source.one_file()).filter(|_| !isotropic) {
+            Some((python, file)) => Some(peer::measure(python, file, options.repeats)?),
+            None => None,
         };
         let (name, optimum) = (source.name.clone(), optima.get(&source.name).copied());
         rows.push(table::Row { name, optimum, isotropic, measured, peer });

@@ -37,7 +37,7 @@ pub(super) struct Spoiled {
 /// # Errors
 /// A graph that cannot be solved even unspoiled.
 pub(super) fn measure(source: &Source, percent: u32, seed: u64) -> anyhow::Result<Option<Spoiled>> {
-    let clean = source.read()?;
+    let clean = source.read_robots()?;
     let between = |graph: &PoseGraph, k: usize| {
         let m = &graph.measurements[k];
         robot_of(m.i) != robot_of(m.j)
