@@ -24,6 +24,7 @@ mod hypothesis;
 mod measured;
 mod pairs;
 mod predict;
+mod promising;
 mod scaled;
 #[cfg(test)]
 mod tests;
@@ -34,6 +35,7 @@ use super::trajectory::Trajectory;
 use crate::config::EstimateConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
 use measured::Measured;
+pub(super) use promising::promising;
 pub use scaled::SimMeasurement;
 
 /// Alignments between two frames considered at most. Of more, this many are taken evenly along the first frame: a rule

@@ -6,7 +6,7 @@
 use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
 use super::trajectory::Trajectory;
-use crate::geometry::{PoseWithCovariance, Relative};
+use crate::geometry::{Disagreement, PoseWithCovariance, Relative};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
@@ -162,24 +162,55 @@ impl Intake {
         relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>,
     ) -> bool {
         let mut any = false;
-        let waiting = |e: &&mut EdgeEstimate| match e.kind {
-            Kind::Sighting => matches!(e.unused, Some(Unused::Unmerged(PairStatus::Provisional))),
-            Kind::Alignment => matches!(e.unused, Some(Unused::Waiting | Unused::Unmerged(PairStatus::Provisional))),
-        };
-        for edge in self.edges.iter_mut().filter(waiting) {
-            let (i, j) = (edge.measurement.i, edge.measurement.j);
-            let Some(predicted) = relative(i, j) else { continue };
-            let pair = (i.frame.min(j.frame), i.frame.max(j.frame));
-            let scale = sigma_scales.get(&pair).copied().unwrap_or(1.0);
-            let distance = predicted.disagreement(&edge.measurement.t_i_j.widened(scale));
-            if distance.is_consistent() {
+        for edge in self.edges.iter_mut().filter(|e| e.is_waiting()) {
+            let scale = edge.sigma_scale(sigma_scales);
+            if edge.disagreement(scale, &relative).is_some_and(|d| d.is_consistent()) {
                 (edge.weight, edge.unused) = (1.0 / (scale * scale), None);
                 any = true;
-            } else {
-                edge.refuse(Unused::Contradicts(distance.distance_squared));
             }
         }
         any
+    }
+
+    /// Says of what still waits, though the map holds both its ends, by how much it contradicts.
+    pub(super) fn refuse_waiting(
+        &mut self,
+        sigma_scales: &BTreeMap<(FrameId, FrameId), f64>,
+        relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>,
+    ) {
+        for edge in self.edges.iter_mut().filter(|e| e.is_waiting()) {
+            let scale = edge.sigma_scale(sigma_scales);
+            if let Some(d) = edge.disagreement(scale, &relative) {
+                edge.refuse(Unused::Contradicts(d.distance_squared));
+            }
+        }
+    }
+}
+
+impl EdgeEstimate {
+    /// Whether the map is to judge it.
+    fn is_waiting(&self) -> bool {
+        match self.unused {
+            Some(Unused::Unmerged(PairStatus::Provisional)) => true,
+            Some(Unused::Waiting) => self.kind == Kind::Alignment,
+            _ => false,
+        }
+    }
+
+    /// The factor that its pair found its standard deviations to need.
+    fn sigma_scale(&self, of_pairs: &BTreeMap<(FrameId, FrameId), f64>) -> f64 {
+        let (i, j) = (self.measurement.i.frame, self.measurement.j.frame);
+        of_pairs.get(&(i.min(j), i.max(j))).copied().unwrap_or(1.0)
+    }
+
+    /// How far it is from what a map says; `None` if the map does not hold both its ends.
+    fn disagreement(
+        &self,
+        sigma_scale: f64,
+        relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>,
+    ) -> Option<Disagreement> {
+        let predicted = relative(self.measurement.i, self.measurement.j)?;
+        Some(predicted.disagreement(&self.measurement.t_i_j.widened(sigma_scale)))
     }
 }
 

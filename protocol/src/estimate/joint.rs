@@ -22,6 +22,9 @@ use crate::wire::fact::ScaleKind;
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 
+/// Rounds in which the map lets in what agrees with it: each makes it surer of the next.
+const ADMISSIONS_MAX: usize = 4;
+
 /// A frame's own trajectory of anchors.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameChain {
@@ -181,9 +184,13 @@ pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate
     let mut map = Map::solve(&mut intake, &mut pairs, start, config);
     let unknown_scale = intake.unknown_scale.clone();
     let scales = pairs::sigma_scales(&pairs);
-    if intake.admit(&scales, |i, j| map.relative(&unknown_scale, i, j)) {
+    for _ in 0..ADMISSIONS_MAX {
+        if !intake.admit(&scales, |i, j| map.relative(&unknown_scale, i, j)) {
+            break;
+        }
         map = Map::solve(&mut intake, &mut pairs, map.start, config);
     }
+    intake.refuse_waiting(&scales, |i, j| map.relative(&unknown_scale, i, j));
     JointEstimate::new(intake, pairs, map)
 }
 

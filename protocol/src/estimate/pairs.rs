@@ -5,7 +5,7 @@
 //! pair that closes a loop of frames must agree with the stronger pairs around it (χ², 99.99 %), or it is left out: a
 //! false merge is worse than a missing one.
 
-use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim};
+use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
 use super::intake::{Chain, Intake, Kind};
 use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
 use super::loops;
@@ -58,7 +58,7 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
         }
     }
     let pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
-        let weighed = spread(&members);
+        let weighed = weighed(intake, (a, b), &members, config);
         let outcome = decide(intake, (a, b), &weighed, config);
         Pair { a, b, members, weighed, outcome, contradicts_loop: false, in_tree: false }
     };
@@ -115,6 +115,9 @@ impl Pair {
                 edge.refuse(Unused::Unmerged(self.outcome.status));
             } else if self.outcome.used.contains(&k) {
                 edge.weight = 1.0 / (self.outcome.sigma_scale * self.outcome.sigma_scale);
+            } else if self.members.len() > self.weighed.len() {
+                // So many stand for the pair that the map may be asked again.
+                edge.refuse(Unused::Waiting);
             } else {
                 edge.refuse(Unused::Outvoted);
             }
@@ -147,10 +150,22 @@ impl Pair {
     }
 }
 
-/// At most [`WEIGHED_MAX`] of a pair's alignments, evenly from first to last in canonical order.
-fn spread(members: &[usize]) -> Vec<usize> {
-    let kept = members.len().min(WEIGHED_MAX);
-    (0..kept).map(|k| members[k * members.len() / kept]).collect()
+/// At most [`WEIGHED_MAX`] of a pair's alignments: the most promising where units are equal, else evenly from first to
+/// last in canonical order.
+fn weighed(intake: &Intake, (a, b): (FrameId, FrameId), members: &[usize], config: &EstimateConfig) -> Vec<usize> {
+    if members.len() <= WEIGHED_MAX {
+        return members.to_vec();
+    }
+    let oriented = members.iter().map(|&k| orient(&intake.edges[k], a));
+    let metric = oriented.map(|(i, j, t)| t.metric().map(|&t_i_j| PairAlignment { i, j, t_i_j }));
+    match metric.collect::<Option<Vec<_>>>() {
+        Some(alignments) if is_rigid(a, b, &intake.unknown_scale) => {
+            let (alpha, beta) = (&intake.chains[&a].trajectory, &intake.chains[&b].trajectory);
+            let chosen = promising(alpha, beta, &alignments, &FrameConsensusConfig::from(config), WEIGHED_MAX);
+            chosen.into_iter().map(|k| members[k]).collect()
+        }
+        _ => (0..WEIGHED_MAX).map(|k| members[k * members.len() / WEIGHED_MAX]).collect(),
+    }
 }
 
 /// By pair of merged frames: by how much the standard deviations of its alignments are to be grown.

@@ -130,10 +130,18 @@ struct System<'a> {
 }
 
 enum Terms {
-    /// Between anchors of fixed unit: the slots of (i, i), (i, j) and (j, j); `None` at the anchor held fixed.
-    Rigid { i: Option<(usize, Slot)>, j: Option<(usize, Slot)>, cross: Option<Slot> },
+    /// Between anchors of fixed unit.
+    Rigid(Rigid),
     /// All others: first scalar and part of each variable, and the slots of the pairs (p, q), p ≤ q, row by row.
     General { parts: Vec<(usize, Part)>, slots: Vec<Slot> },
+}
+
+/// First scalar and slot of (i, i) and of (j, j), and the slot of (i, j); `None` at the anchor held fixed.
+#[derive(Clone, Copy)]
+struct Rigid {
+    i: Option<(usize, Slot)>,
+    j: Option<(usize, Slot)>,
+    cross: Option<Slot>,
 }
 
 impl<'a> System<'a> {
@@ -157,7 +165,11 @@ impl Terms {
             let own = |v: usize| (pattern.start(v), pattern.slot(v, v));
             let i = find(|p| matches!(p, Part::AnchorI));
             let j = find(|p| matches!(p, Part::AnchorJ));
-            return Self::Rigid { i: i.map(own), j: j.map(own), cross: i.zip(j).map(|(a, b)| pattern.slot(a, b)) };
+            return Self::Rigid(Rigid {
+                i: i.map(own),
+                j: j.map(own),
+                cross: i.zip(j).map(|(a, b)| pattern.slot(a, b)),
+            });
         }
         let pairs = parts.iter().enumerate().flat_map(|(k, a)| parts[k..].iter().map(move |b| (a.0, b.0)));
         let slots = pairs.map(|(a, b)| pattern.slot(a, b)).collect();
@@ -179,7 +191,7 @@ impl Objective for System<'_> {
     fn linearise(&self, values: &Vec<Sim3>, normal: &mut Normal) {
         for (edge, terms) in self.graph.edges().iter().zip(&self.terms) {
             match terms {
-                Terms::Rigid { i, j, cross } => add_rigid(edge, values, (*i, *j, *cross), normal),
+                Terms::Rigid(rigid) => add_rigid(edge, values, *rigid, normal),
                 Terms::General { parts, slots } => add_general(edge, values, parts, slots, normal),
             }
         }
@@ -202,12 +214,7 @@ impl Objective for System<'_> {
 }
 
 /// With `J_i = −J_j A`, `A = Ad((X_i⁻¹ X_j)⁻¹)`: `H_jj = J_jᵀ W J_j`, `H_ij = −Aᵀ H_jj`, `H_ii = Aᵀ H_jj A`.
-fn add_rigid(
-    edge: &Edge,
-    values: &[Sim3],
-    (i, j, cross): (Option<(usize, Slot)>, Option<(usize, Slot)>, Option<Slot>),
-    normal: &mut Normal,
-) {
+fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal: &mut Normal) {
     let (residual, by_j, adjoint) = edge.linearise_rigid(values);
     let information: Matrix6<f64> = edge.information.fixed_view::<6, 6>(0, 0).into_owned();
     let left = by_j.transpose() * information;
