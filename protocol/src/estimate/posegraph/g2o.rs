@@ -9,6 +9,7 @@ use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_weigh
 use crate::geometry::so3::So3;
 use crate::geometry::{Se3, se3};
 use nalgebra::{Matrix3, Matrix6, Vector3};
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use thiserror::Error;
 
@@ -80,13 +81,19 @@ pub enum Fault {
 pub struct Parser {
     graph: PoseGraph,
     line: usize,
+    /// Measurements of the files before this one.
+    earlier: usize,
+    /// Measurements by their ends.
+    between: BTreeMap<(u64, u64), Vec<usize>>,
     planar: Option<bool>,
 }
 
 impl Parser {
-    /// Begins the next file of the same graph: lines count from 1 again.
+    /// Begins the next file of the same graph: lines count from 1 again. A measurement between two robots stands in the
+    /// files of both; what an earlier file holds to the bit is not taken again.
     pub fn begin(&mut self) {
         self.line = 0;
+        self.earlier = self.graph.measurements.len();
     }
 
     /// Takes the next line.
@@ -166,8 +173,16 @@ impl Parser {
         self.room_for(&[i, j])?;
         self.graph.poses.entry(i).or_default();
         self.graph.poses.entry(j).or_default();
-        let line = self.line;
-        self.graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
+        let known = self.between.entry((i, j)).or_default();
+        let told = |&&k: &&usize| {
+            let m = &self.graph.measurements[k];
+            k < self.earlier && (m.t_i_j, m.information) == (t_i_j, information)
+        };
+        if known.iter().find(told).is_none() {
+            known.push(self.graph.measurements.len());
+            let line = self.line;
+            self.graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
+        }
         Ok(())
     }
 

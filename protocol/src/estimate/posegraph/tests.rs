@@ -244,6 +244,22 @@ fn faults_name_their_line_and_what_to_do() {
 }
 
 #[test]
+fn what_two_robots_files_both_hold_counts_once() {
+    let edge = "EDGE_SE2 0 1 1 0 0.1 1 0 0 1 0 1";
+    let mut parser = Parser::default();
+    for line in [edge, edge, "EDGE_SE2 0 1 1 0 0.2 1 0 0 1 0 1"] {
+        parser.line(line).unwrap();
+    }
+    // Twice in one file is two measurements; again in another robot's file is none, and a third value is one.
+    parser.begin();
+    for line in [edge, "EDGE_SE2 0 1 1 0 0.3 1 0 0 1 0 1"] {
+        parser.line(line).unwrap();
+    }
+    assert_eq!(parser.line("nonsense").unwrap_err().line, 3);
+    assert_eq!(parser.finish().measurements.len(), 4);
+}
+
+#[test]
 fn graphs_beyond_the_limits_are_refused() {
     let mut parser = Parser::default();
     for k in 0..POSES_MAX {

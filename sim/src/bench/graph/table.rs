@@ -4,7 +4,7 @@ use super::measure::Measured;
 use super::peer::Peer;
 use std::fmt::Write;
 
-/// How far from the known optimum a minimum may lie, as a share of it.
+/// How far above the known optimum a minimum may lie, as a share of it.
 const OPTIMUM_TOLERANCE: f64 = 1e-6;
 
 /// One graph.
@@ -21,9 +21,7 @@ impl Row {
     /// Whether it converged, to the known optimum, and was certified.
     pub(super) fn is_good(&self) -> bool {
         let m = &self.measured;
-        m.converged
-            && m.chordal.certificate.certified
-            && self.excess().is_none_or(|excess| excess.abs() <= OPTIMUM_TOLERANCE)
+        m.converged && m.chordal.certificate.certified && self.excess().is_none_or(|excess| excess <= OPTIMUM_TOLERANCE)
     }
 
     /// By what share SE-Sync's cost lies above the known optimum.
