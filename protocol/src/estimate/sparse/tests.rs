@@ -19,7 +19,7 @@ impl Case {
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let sizes: Vec<usize> = (0..variables).map(|_| rng.random_range(1..7)).collect();
         let mut pairs: Vec<(usize, usize)> = (0..variables).map(|v| (v, v)).collect();
-        pairs.extend((1..variables).filter(|_| seed % 3 > 0).map(|v| (v - 1, v)));
+        pairs.extend((1..variables).filter(|_| !seed.is_multiple_of(3)).map(|v| (v - 1, v)));
         pairs.extend((0..couplings).map(|_| (rng.random_range(0..variables), rng.random_range(0..variables))));
         let pattern = BlockPattern::new(&sizes, pairs.iter().copied()).unwrap();
         let mut values = vec![0.0; pattern.value_count()];

@@ -3,6 +3,8 @@
 mod files;
 mod measure;
 mod peer;
+mod scale;
+mod swarm;
 mod table;
 
 use crate::bar::progress_bar;
@@ -15,8 +17,15 @@ use std::path::PathBuf;
 pub struct GraphBench {
     /// Folder of g2o graphs, searched through; a folder of robots' files is one graph. Certified optima come from the
     /// optima.csv in it
-    #[arg(long, value_name = "DIR")]
-    pub data: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "scale")]
+    pub data: Option<PathBuf>,
+    /// Instead of files, a swarm of so many robots and anchors each, which then grows anchor by anchor: batch solve,
+    /// covariances, single updates, memory. Exit code 1 if the grown estimate is not that of a batch solve
+    #[arg(long, value_name = "ROBOTSxANCHORS", conflicts_with = "data")]
+    pub scale: Option<scale::Size>,
+    /// The swarm's seed
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..1 << 62))]
+    pub seed: u64,
     /// Only graphs whose name contains this
     #[arg(long, value_name = "STR", default_value = "")]
     pub filter: String,
@@ -33,8 +42,14 @@ pub struct GraphBench {
 /// # Errors
 /// A folder, file or interpreter that cannot be used.
 pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
-    let optima = files::optima(&options.data)?;
-    let sources = files::find(&options.data, &optima, &options.filter)?;
+    if let Some(size) = options.scale {
+        let (text, is_good) = scale::run(size, options.seed)?;
+        write!(std::io::stdout().lock(), "{text}")?;
+        return Ok(is_good);
+    }
+    let Some(data) = &options.data else { anyhow::bail!("give --data or --scale") };
+    let optima = files::optima(data)?;
+    let sources = files::find(data, &optima, &options.filter)?;
     let bar = progress_bar(sources.len() as u64, "graphs")?;
     let mut rows = Vec::new();
     for source in &sources {
