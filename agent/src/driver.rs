@@ -40,6 +40,10 @@ pub trait Core: Send + 'static {
     fn status(&self) -> StatusView;
     /// What the core believes now.
     fn snapshot(&self, now: Instant) -> Snapshot;
+    /// See [`Agent::overview`].
+    fn overview(&self, now: Instant) -> Snapshot {
+        self.snapshot(now)
+    }
 }
 
 impl Core for Agent {
@@ -60,6 +64,9 @@ impl Core for Agent {
     }
     fn snapshot(&self, now: Instant) -> Snapshot {
         Self::snapshot(self, now)
+    }
+    fn overview(&self, now: Instant) -> Snapshot {
+        Self::overview(self, now)
     }
 }
 
@@ -105,14 +112,29 @@ impl Clock {
 
 /// Asks the driver for snapshots.
 #[derive(Clone, Debug)]
-pub struct Snapshots(mpsc::Sender<oneshot::Sender<Snapshot>>);
+pub struct Snapshots(mpsc::Sender<SnapshotRequest>);
+
+#[derive(Debug)]
+struct SnapshotRequest {
+    map: bool,
+    reply: oneshot::Sender<Snapshot>,
+}
 
 impl Snapshots {
     /// What the core believes now; `None` when the driver has ended.
     pub async fn take(&self) -> Option<Snapshot> {
-        let (sender, receiver) = oneshot::channel();
-        self.0.send(sender).await.ok()?;
-        receiver.await.ok()
+        self.ask(true).await
+    }
+
+    /// The same with an empty map.
+    pub async fn overview(&self) -> Option<Snapshot> {
+        self.ask(false).await
+    }
+
+    async fn ask(&self, map: bool) -> Option<Snapshot> {
+        let (reply, answer) = oneshot::channel();
+        self.0.send(SnapshotRequest { map, reply }).await.ok()?;
+        answer.await.ok()
     }
 }
 
@@ -151,7 +173,7 @@ pub struct Finished {
 pub struct Driver<C, N> {
     parts: Parts<C, N>,
     workers: Arc<Semaphore>,
-    views: mpsc::Receiver<oneshot::Sender<Snapshot>>,
+    views: mpsc::Receiver<SnapshotRequest>,
     journal_flushed: Instant,
     inputs: u64,
 }
@@ -176,8 +198,10 @@ impl<C: Core, N: Network> Driver<C, N> {
                 biased;
                 () = &mut stop => break,
                 () = clock.reach(due) => Some(Input::Timeout),
-                Some(reply) = self.views.recv() => {
-                    let _ = reply.send(self.parts.core.snapshot(clock.now())); // whoever asked may have gone
+                Some(SnapshotRequest { map, reply }) = self.views.recv() => {
+                    let core = &self.parts.core;
+                    let seen = if map { core.snapshot(clock.now()) } else { core.overview(clock.now()) };
+                    let _ = reply.send(seen); // whoever asked may have gone
                     None
                 }
                 input = self.parts.outbox.next() => input,

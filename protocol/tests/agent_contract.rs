@@ -262,6 +262,23 @@ fn a_closed_epoch_is_not_continued_by_any_later_run() {
 }
 
 #[test]
+fn what_was_solved_for_one_frame_of_ours_is_not_told_of_the_next() {
+    let mut wires = Wires::new(vec![agent(0, Restored::default())]);
+    for keyframe in drive(&World::new(1), 0, 12).0 {
+        wires.input(0, Input::Keyframe(keyframe));
+    }
+    wires.run(Duration::from_secs(20));
+    let before = wires.agents[0].snapshot(wires.now);
+    assert!(before.frames.frames[0].t_own_frame.is_some());
+    assert!(!before.map.submaps.is_empty() && before.map.submaps.iter().all(|s| s.t_own_anchor.is_some()));
+    wires.input(0, Input::Command(Command::NewEpoch));
+    let after = wires.agents[0].snapshot(wires.now);
+    assert_ne!(after.frames.own, before.frames.own);
+    assert!(after.frames.frames.iter().all(|frame| frame.t_own_frame.is_none()), "{:?}", after.frames);
+    assert!(after.map.submaps.iter().all(|submap| submap.t_own_anchor.is_none()));
+}
+
+#[test]
 fn a_restart_resumes_the_log_where_it_was_durable() {
     let world = World::new(1);
     let (keyframes, _) = drive(&world, 0, 19);

@@ -45,6 +45,9 @@ pub struct SolveArgs {
     /// Minimise SE-Sync's cost, prove that its minimum is global, and start from there.
     #[arg(long, conflicts_with = "start")]
     pub certify: bool,
+    /// Take the isotropic weights of SE-Sync in place of the information matrices.
+    #[arg(long)]
+    pub isotropic: bool,
     /// Leave out measurements that contradict the rest, and list them. Consecutive poses of a robot (the top byte of
     /// their ids) are tied by its odometry, which is trusted.
     #[arg(long, conflicts_with_all = ["start", "certify", "marginals"])]
@@ -119,7 +122,7 @@ pub fn run(command: &GraphCommand) -> Result<bool> {
 }
 
 fn solve(args: &SolveArgs) -> Result<bool> {
-    let graph = read(&args.files)?;
+    let graph = graph_of(args)?;
     let (mut good, mut solved, mut marginals) = (true, BTreeMap::new(), String::new());
     let parts = graph.parts();
     for (k, part) in parts.iter().enumerate() {
@@ -167,6 +170,11 @@ fn solve(args: &SolveArgs) -> Result<bool> {
     Ok(good)
 }
 
+fn graph_of(args: &SolveArgs) -> Result<PoseGraph> {
+    let graph = read(&args.files)?;
+    Ok(if args.isotropic { graph.isotropic() } else { graph })
+}
+
 fn certificate_line(part: &PoseGraph, outcome: &ChordalOutcome) -> String {
     let certificate = &outcome.certificate;
     let verdict = match (certificate.certified, part.is_isotropic()) {
@@ -195,19 +203,21 @@ fn add_marginal(out: &mut String, id: u64, covariance: &nalgebra::Matrix6<f64>) 
 }
 
 fn solve_robustly(args: &SolveArgs) -> Result<bool> {
-    let graph = read(&args.files)?;
+    let graph = graph_of(args)?;
     let began = Instant::now();
     let config = EstimateConfig { iterations_max: args.iterations as usize, ..EstimateConfig::default() };
     let solved = graph.solve_robustly(&config);
     let seconds = began.elapsed().as_secs_f64();
     let count = |keep: fn(&Verdict) -> bool| solved.verdicts.iter().filter(|v| keep(v)).count();
     say(&format!(
-        "{} poses in {} parts; {} odometry, {} of {} other measurements used; χ² {:.3} of {} dof, {}, {seconds:.3} s",
+        "{} poses in {} parts; {} odometry, {} of {} other measurements used; σ as told × {:.2}, \
+         χ² {:.3} of {} dof, {}, {seconds:.3} s",
         graph.poses.len(),
         solved.components.len(),
         count(|v| *v == Verdict::Odometry),
         count(|v| matches!(v, Verdict::Used(_))),
         count(|v| *v != Verdict::Odometry),
+        solved.sigma_scale,
         solved.map.chi2,
         solved.map.dof,
         if solved.map.converged { "converged" } else { "NOT CONVERGED" },
@@ -228,9 +238,10 @@ fn reasons(solved: &RobustSolved) -> Vec<String> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     for verdict in &solved.verdicts {
         if let Verdict::Unused(reason) = verdict {
-            // What stands in brackets is each one's own number.
+            // From the first number or bracket on, the text is each one's own.
             let text = reason.to_string();
-            *counts.entry(text.split(" (").next().unwrap_or_default().to_owned()).or_default() += 1;
+            let common = text.split(|c: char| c == '(' || c.is_ascii_digit()).next().unwrap_or_default();
+            *counts.entry(common.trim_end().to_owned()).or_default() += 1;
         }
     }
     counts.into_iter().map(|(reason, n)| format!("  {n} left out: {reason}")).collect()

@@ -1,5 +1,6 @@
 //! What the agent shows: its views as JSON, for whoever asks, and published while somebody subscribes. One snapshot
-//! serves all that ask within a short time, so that asking cannot slow the core down.
+//! serves all that ask within a short time, so that asking cannot slow the core down. The map, which alone may take many
+//! megabytes, is made only for those who want it.
 
 use super::session::LinkError;
 use super::{Shared, refused};
@@ -17,6 +18,8 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Query;
 
+/// The view that grows with the map.
+const MAP: &str = "map";
 /// Questions that may wait.
 const WAITING_MAX: usize = 32;
 /// A snapshot serves for this long.
@@ -27,18 +30,21 @@ const REPEAT: Duration = Duration::from_secs(5);
 /// The views of one moment, by name.
 pub type Views = BTreeMap<&'static str, Vec<u8>>;
 
-/// A snapshot as JSON, a document for each view. `shell` are the agent's own counters, shown in `stats`.
-pub fn render(snapshot: &Snapshot, shell: &BTreeMap<String, u64>) -> serde_json::Result<Views> {
+/// Views of a snapshot as JSON, a document for each. `shell` are the agent's own counters, shown in `stats`.
+pub fn render(snapshot: &Snapshot, map: bool, shell: &BTreeMap<String, u64>) -> serde_json::Result<Views> {
     let mut stats = serde_json::to_value(&snapshot.stats)?;
     stats["shell"] = serde_json::to_value(shell)?;
-    Ok(BTreeMap::from([
+    let mut views = BTreeMap::from([
         ("status", serde_json::to_vec(&snapshot.status)?),
         ("frames", serde_json::to_vec(&snapshot.frames)?),
         ("poses", serde_json::to_vec(&snapshot.poses)?),
-        ("map", serde_json::to_vec(&snapshot.map)?),
         ("graph", serde_json::to_vec(&snapshot.graph)?),
         ("stats", serde_json::to_vec(&stats)?),
-    ]))
+    ]);
+    if map {
+        views.insert(MAP, serde_json::to_vec(&snapshot.map)?);
+    }
+    Ok(views)
 }
 
 pub(super) async fn start(
@@ -90,9 +96,14 @@ impl Server {
         let mut ticks = tokio::time::interval(interval);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
+            let stale = self.last.as_ref().map(|(when, _)| *when + FRESH);
             let served = tokio::select! {
                 Some(question) = questions.recv() => self.answer(question).await,
                 _ = ticks.tick(), if !self.publishers.is_empty() => self.publish().await,
+                () = tokio::time::sleep_until(stale.unwrap_or_else(Instant::now)), if stale.is_some() => {
+                    self.last = None;
+                    Some(())
+                }
                 else => None,
             };
             if served.is_none() {
@@ -102,13 +113,16 @@ impl Server {
     }
 
     async fn answer(&mut self, question: Query) -> Option<()> {
-        let views = self.views().await?;
-        for (view, json) in views.iter() {
-            let key = self.shared.own(&format!("view/{view}"));
-            let wanted = zenoh::key_expr::KeyExpr::new(key.as_str()).is_ok_and(|k| question.key_expr().intersects(&k));
-            if wanted {
-                self.shared.reply(question.clone(), key, json.clone(), keys::view_encoding(view));
-            }
+        let own = |view: &str| self.shared.own(&format!("view/{view}"));
+        let asked = |view: &&str| {
+            let key = own(view);
+            zenoh::key_expr::KeyExpr::new(key.as_str()).is_ok_and(|key| question.key_expr().intersects(&key))
+        };
+        let wanted: Vec<&str> = keys::VIEWS.into_iter().filter(asked).collect();
+        let views = self.views(wanted.contains(&MAP)).await?;
+        for view in wanted {
+            let (key, json) = (self.shared.own(&format!("view/{view}")), views[view].clone());
+            self.shared.reply(question.clone(), key, json, keys::view_encoding(view));
         }
         Some(())
     }
@@ -124,7 +138,7 @@ impl Server {
         if wanted.is_empty() {
             return Some(());
         }
-        let views = self.views().await?;
+        let views = self.views(wanted.contains(&MAP)).await?;
         for view in wanted {
             self.publish_one(view, &views[view]).await;
         }
@@ -149,12 +163,15 @@ impl Server {
         self.published.insert(view, (now, json.to_vec()));
     }
 
-    async fn views(&mut self) -> Option<Arc<Views>> {
-        if let Some((_, views)) = self.last.as_ref().filter(|(when, _)| when.elapsed() < FRESH) {
+    /// The views of a moment that has just been, with the map if it is wanted.
+    async fn views(&mut self, map: bool) -> Option<Arc<Views>> {
+        let serves =
+            |(when, views): &&(Instant, Arc<Views>)| when.elapsed() < FRESH && (views.contains_key(MAP) || !map);
+        if let Some((_, views)) = self.last.as_ref().filter(serves) {
             return Some(views.clone());
         }
-        let snapshot = self.snapshots.take().await?;
-        let rendered = render(&snapshot, &self.shared.drops().counts());
+        let snapshot = if map { self.snapshots.take().await? } else { self.snapshots.overview().await? };
+        let rendered = render(&snapshot, map, &self.shared.drops().counts());
         let views = Arc::new(rendered.unwrap_or_else(|reason| {
             tracing::error!(%reason, "a view cannot be written as JSON; this is a bug");
             keys::VIEWS.iter().map(|view| (*view, b"null".to_vec())).collect()

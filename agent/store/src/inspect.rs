@@ -1,7 +1,7 @@
 //! Reading a whole store without trusting it: what is sound, what is not, and whether an entry may be missing.
 
 use crate::mend::Medium;
-use crate::tables::{self, BLOBS, ENTRIES, FORKS, META, PRIVATE, number, split_key, unseal};
+use crate::tables::{self, BLOBS, ENTRIES, FORKS, META, PRIVATE, number, split_key, unseal, unsealed};
 use crate::{SCHEMA, StoreError, mend};
 use merganser_protocol::agent::io::Record;
 use merganser_protocol::ids::{EntryId, Hash, SubmapId};
@@ -170,12 +170,12 @@ impl Inspection {
             let id = EntryId { frame, seq };
             // Of old, nothing was sealed: an entry at least names its place.
             let sound = if version < SCHEMA {
-                Entry::decode(&value).is_ok_and(|entry| entry.id() == id).then_some(&value[..])
+                Entry::decode(&value).is_ok_and(|entry| entry.id() == id).then_some(value)
             } else {
-                unseal("entries", &key, &value)
+                unsealed("entries", &key, value)
             };
             match sound {
-                Some(bytes) => self.records.push(Record::Entry { id, bytes: bytes.to_vec() }),
+                Some(bytes) => self.records.push(Record::Entry { id, bytes }),
                 None => self.add("entries", id.to_string(), "its bytes have changed".into()),
             }
         }
@@ -183,9 +183,9 @@ impl Inspection {
 
     fn read_blobs(&mut self, db: &Database, version: u32) {
         for (key, value) in self.scan(db, BLOBS, "blobs") {
-            let bytes = if version < SCHEMA { Some(&value[..]) } else { unseal("blobs", &key, &value) };
+            let bytes = if version < SCHEMA { Some(value) } else { unsealed("blobs", &key, value) };
             match bytes.filter(|bytes| Hash::of(bytes).0 == key) {
-                Some(bytes) => self.records.push(Record::Blob { hash: Hash(key), bytes: bytes.to_vec() }),
+                Some(bytes) => self.records.push(Record::Blob { hash: Hash(key), bytes }),
                 None => self.add("blobs", Hash(key).to_string(), "its bytes are not those that its hash names".into()),
             }
         }
@@ -195,8 +195,8 @@ impl Inspection {
         for (key, value) in self.scan(db, PRIVATE, "private") {
             let (frame, index) = split_key(key);
             let submap = SubmapId { frame, index };
-            match if version < SCHEMA { Some(&value[..]) } else { unseal("private", &key, &value) } {
-                Some(bytes) => self.records.push(Record::Private { submap, bytes: bytes.to_vec() }),
+            match if version < SCHEMA { Some(value) } else { unsealed("private", &key, value) } {
+                Some(bytes) => self.records.push(Record::Private { submap, bytes }),
                 None => self.add("private", submap.to_string(), "its bytes have changed".into()),
             }
         }

@@ -35,8 +35,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Version of the tables that this crate writes. Version 1 had no seals; it is migrated.
 pub const SCHEMA: u32 = 2;
-/// Cache of the database, in bytes.
-const CACHE_BYTES: usize = 16 << 20;
+/// Cache of the database, in bytes. Facts are read at a start and then only written, so that a small one serves.
+const CACHE_BYTES: usize = 2 << 20;
 
 /// Whose store it is.
 #[derive(Clone, Debug, PartialEq, Eq)]

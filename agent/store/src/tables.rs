@@ -36,6 +36,13 @@ pub(crate) fn unseal<'a>(table: &str, key: &[u8], sealed: &'a [u8]) -> Option<&'
     (*seal == seal_of(table, key, value)).then_some(value)
 }
 
+/// [`unseal`] without a second copy of the value.
+pub(crate) fn unsealed(table: &str, key: &[u8], mut sealed: Vec<u8>) -> Option<Vec<u8>> {
+    unseal(table, key, &sealed)?;
+    sealed.drain(..SEAL_LEN);
+    Some(sealed)
+}
+
 fn seal_of(table: &str, key: &[u8], value: &[u8]) -> [u8; SEAL_LEN] {
     // The lengths of table and key are fixed per table (names of `meta` are not, but none begins another).
     let hash = Hash::of(&[table.as_bytes(), key, value].concat());

@@ -4,15 +4,17 @@
 use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Measured};
-use super::knowledge::{Agreement, Pair, pair_of};
+use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
 use super::negotiation::{
-    ALIGNMENTS_PER_FRAME_PAIR, Candidate, FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work,
+    ALIGNMENTS_PER_FRAME_PAIR, FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work,
 };
+use super::shortlist::Candidate;
+use crate::config::AlignConfig;
 use crate::geometry::Relative;
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::Summary;
 use crate::time::Instant;
-use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, SubmapFact, VerdictFact, VerdictOutcome};
+use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, VerdictFact, VerdictOutcome};
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -36,48 +38,26 @@ impl Agent {
 
     /// Pairs a submap that became known with all that it may overlap: one of ours with all, one of another's with ours.
     fn note_candidates(&mut self, new: SubmapId) {
-        let Some(summary) = self.knowledge.submap(new).and_then(summary_of) else { return };
-        let ours = new.frame.robot == self.me.robot;
-        let limit = self.config.align.candidates_max;
-        // Asked for once, not for each of thousands of pairs.
-        let mut least = self.negotiation.least_similarity(limit);
-        let wanted = match self.negotiation.wishes.len() < limit {
-            true => self.config.align.similarity_min,
-            false => self.config.align.similarity_min.max(least),
-        };
-        let compare = |(id, fact): (SubmapId, &SubmapFact)| Some((id, summary.similarity(&summary_of(fact)?)));
-        let alike = |(_, similarity): &(SubmapId, f64)| *similarity >= wanted;
-        let others: Vec<(SubmapId, f64)> = match ours {
-            true => self.knowledge.submaps().filter_map(compare).filter(alike).collect(),
-            false => self.knowledge.submaps_of(self.me.robot).filter_map(compare).filter(alike).collect(),
-        };
-        for (other, similarity) in others {
-            let (mine, theirs) = if ours { (new, other) } else { (other, new) };
-            if similarity < least && self.negotiation.wishes.len() >= limit {
-                continue;
-            }
-            let pair = pair_of(mine, theirs);
-            if Negotiation::responsible(pair) == self.me.robot || mine.frame.robot == theirs.frame.robot {
-                if similarity >= least && self.may_pair(mine, theirs) {
-                    self.negotiation.add_candidate(Candidate { mine, theirs, similarity, wished: false }, limit);
-                    least = self.negotiation.least_similarity(limit);
-                }
-            } else if self.negotiation.wishes.len() < limit && self.may_pair(mine, theirs) {
-                self.negotiation.wishes.insert(pair, similarity);
-            }
+        let Some(known) = self.knowledge.submap(new) else { return };
+        let looks = Looks { me: self.me.robot, knowledge: &self.knowledge, config: &self.config.align };
+        if new.frame.robot != self.me.robot {
+            looks.pair_up(&mut self.negotiation, &looks.ours(), [(new, known)].into_iter());
+        } else if let Some(summary) = &known.summary {
+            looks.pair_up(&mut self.negotiation, &[(new, summary)], self.knowledge.submaps());
         }
     }
 
-    fn may_pair(&self, mine: SubmapId, theirs: SubmapId) -> bool {
-        let pair = pair_of(mine, theirs);
-        let far = mine.frame != theirs.frame || mine.index.abs_diff(theirs.index) >= LOOP_GAP;
-        far && !self.negotiation.is_tried(pair) && !self.knowledge.is_stated(pair)
+    /// Pairs all of our submaps with all that they may overlap.
+    pub(super) fn note_all_candidates(&mut self) {
+        let looks = Looks { me: self.me.robot, knowledge: &self.knowledge, config: &self.config.align };
+        looks.pair_up(&mut self.negotiation, &looks.ours(), self.knowledge.submaps());
+        self.negotiation.stir();
     }
 
     /// Somebody aligned one of our submaps: we owe an answer, once.
     fn note_verification(&mut self, id: EntryId, fact: &AlignmentFact) {
         self.negotiation.mark_tried((fact.i, fact.j));
-        self.negotiation.wishes.remove(&(fact.i, fact.j));
+        self.negotiation.wishes.remove((fact.i, fact.j));
         let ours = fact.i.frame.robot == self.me.robot || fact.j.frame.robot == self.me.robot;
         let owed = ours && id.frame.robot != self.me.robot && !self.knowledge.has_verdict(id, self.me.robot);
         if owed && self.negotiation.verify.len() < VERIFICATIONS_MAX {
@@ -210,7 +190,7 @@ impl Agent {
 
     /// Distance between two anchors by the joint estimate, if they are connected.
     fn distance(&self, a: SubmapId, b: SubmapId) -> Option<f64> {
-        let position = |id| self.map.anchors.get(&id).map(|t: &Relative| t.sim().translation);
+        let position = |id| self.map.solved.anchors.get(&id).map(|t: &Relative| t.sim().translation);
         Some((position(a)? - position(b)?).norm())
     }
 
@@ -359,10 +339,59 @@ impl Agent {
             .wishes
             .iter()
             .filter(|(pair, _)| reachable(pair) && self.distance(pair.0, pair.1).is_none())
-            .max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0)))
-            .map(|(pair, _)| *pair)?;
-        self.negotiation.wishes.remove(&best);
+            .max_by(|a, b| a.1.similarity.total_cmp(&b.1.similarity).then(b.0.cmp(&a.0)))
+            .map(|(pair, _)| pair)?;
+        self.negotiation.wishes.remove(best);
         Some(best)
+    }
+}
+
+/// What the summaries of submaps say of which may overlap.
+struct Looks<'a> {
+    me: RobotId,
+    knowledge: &'a Knowledge,
+    config: &'a AlignConfig,
+}
+
+impl Looks<'_> {
+    fn ours(&self) -> Vec<(SubmapId, &Summary)> {
+        let ours = self.knowledge.submaps_of(self.me);
+        ours.filter_map(|(id, known)| Some((id, known.summary.as_ref()?))).collect()
+    }
+
+    /// Notes each of `ours` with each of `all` that may overlap it: as a candidate if we are to begin, else as a wish.
+    /// Millions of pairs at a start: each of `all` is looked at once, and few are alike enough for more than a glance.
+    fn pair_up<'k>(
+        &self,
+        negotiation: &mut Negotiation,
+        ours: &[(SubmapId, &Summary)],
+        all: impl Iterator<Item = (SubmapId, &'k Known)>,
+    ) {
+        let limit = self.config.candidates_max;
+        let wanted = |negotiation: &Negotiation| self.config.similarity_min.max(negotiation.least_similarity(limit));
+        let mut least = wanted(negotiation);
+        for (theirs, known) in all {
+            let Some(looks) = &known.summary else { continue };
+            for &(mine, summary) in ours {
+                let Some(similarity) = summary.similarity_from(looks, least) else { continue };
+                let pair = pair_of(mine, theirs);
+                if !self.may_pair(mine, theirs) || negotiation.is_tried(pair) {
+                    continue;
+                }
+                let candidate = Candidate { mine, theirs, similarity, wished: false };
+                if Negotiation::responsible(pair) == self.me || mine.frame.robot == theirs.frame.robot {
+                    negotiation.add_candidate(candidate, limit);
+                } else {
+                    negotiation.wishes.offer(candidate, limit);
+                }
+                least = wanted(negotiation);
+            }
+        }
+    }
+
+    fn may_pair(&self, mine: SubmapId, theirs: SubmapId) -> bool {
+        let far = mine.frame != theirs.frame || mine.index.abs_diff(theirs.index) >= LOOP_GAP;
+        far && !self.knowledge.is_stated(pair_of(mine, theirs))
     }
 }
 
@@ -373,8 +402,4 @@ fn t_i_j(work: &Work, t_mine_theirs: &Relative) -> Relative {
 
 fn to_support(support: f64) -> u16 {
     support.clamp(0.0, f64::from(u16::MAX)) as u16
-}
-
-fn summary_of(fact: &SubmapFact) -> Option<Summary> {
-    Summary::decode(&fact.summary).ok()
 }

@@ -3,7 +3,7 @@
 
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, SubmapConfig};
-use crate::estimate::joint::{JointEstimate, MapProblem, solve_map};
+use crate::estimate::joint::{EdgeEstimate, MapProblem, PairEstimate, solve_map};
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use crate::submap::{self, Described, Features, Keypoints, RefineConfig, Submap};
@@ -70,13 +70,32 @@ pub enum JobResult {
     Solved(Box<Solved>),
 }
 
-/// The joint estimate and what people look at most.
-#[derive(Clone, Debug)]
+/// What is kept of a joint estimate. The factorisation it was drawn from takes kilobytes a submap and goes.
+#[derive(Clone, Debug, Default)]
 pub struct Solved {
-    /// The estimate.
-    pub estimate: Arc<JointEstimate>,
     /// `t_own_anchor` of every submap connected to our frame.
     pub anchors: BTreeMap<SubmapId, Relative>,
+    /// Every frame of the problem.
+    pub frames: BTreeMap<FrameId, Placed>,
+    /// Every pair of frames with an agreed alignment, ascending.
+    pub pairs: Vec<PairEstimate>,
+    /// Every alignment and sighting in canonical order, used or not.
+    pub edges: Vec<EdgeEstimate>,
+    /// Weighted sum of squared residuals.
+    pub chi2: f64,
+    /// Degrees of freedom.
+    pub dof: usize,
+    /// Anchors.
+    pub nodes: usize,
+}
+
+/// Where a frame is.
+#[derive(Clone, Debug)]
+pub struct Placed {
+    /// The smallest frame of its component.
+    pub with: FrameId,
+    /// `t_own_frame`, if it is connected to ours.
+    pub t_own_frame: Option<Relative>,
 }
 
 /// An alignment that passed every gate.
@@ -117,9 +136,20 @@ impl Job {
 
 impl SolveJob {
     fn run(&self) -> Solved {
-        let estimate = Arc::new(solve_map(&self.problem, &self.config));
-        let anchors = estimate.anchors(self.own).into_iter().collect();
-        Solved { estimate, anchors }
+        let estimate = solve_map(&self.problem, &self.config);
+        let components = estimate.components().filter_map(|frames| Some((*frames.iter().min()?, frames)));
+        let placed = |frame| estimate.frame(self.own, frame);
+        Solved {
+            anchors: estimate.anchors(self.own).into_iter().collect(),
+            frames: components
+                .flat_map(|(with, frames)| frames.iter().map(move |&f| (f, Placed { with, t_own_frame: placed(f) })))
+                .collect(),
+            pairs: estimate.pairs().to_vec(),
+            edges: estimate.edges().to_vec(),
+            chi2: estimate.chi2,
+            dof: estimate.dof,
+            nodes: estimate.nodes,
+        }
     }
 }
 

@@ -3,9 +3,11 @@
 
 use super::distortion;
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
-use crate::geometry::{Covariance, PoseWithCovariance, Relative, SimWithCovariance};
-use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
-use crate::wire::fact::{AlignmentFact, Fact, SightingFact, SubmapFact, VerdictFact, VerdictOutcome};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, SimWithCovariance};
+use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
+use crate::submap::Summary;
+use crate::time::Stamp;
+use crate::wire::fact::{AlignmentFact, Fact, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// χ² 99.9 % quantiles for 6 and 7 degrees of freedom: two independent alignments of one pair agree below these.
@@ -31,10 +33,40 @@ pub enum Agreement {
     Disputed,
 }
 
+/// What is kept of a submap's fact at hand. Of 36,000 submaps there is no room for more; the odometry's covariance is
+/// read again from the entry when it is needed.
+#[derive(Clone, Debug)]
+pub struct Known {
+    /// The entry that states it.
+    pub entry: EntryId,
+    /// Stamps of the first and last keyframe.
+    pub stamps: [Stamp; 2],
+    /// `t_prev_this`.
+    pub t_prev_this: Se3,
+    /// Half extents of the cloud about the anchor, in frame units.
+    pub extent: [f32; 3],
+    /// Address of the keypoint blob.
+    pub blob: Hash,
+    /// Unit of the frame.
+    pub scale: ScaleKind,
+    /// What it looks like, if that can be read.
+    pub summary: Option<Summary>,
+}
+
+/// What the joint estimate is to be a function of.
+#[derive(Clone, Debug)]
+pub struct Question {
+    /// The frames that are tied to others or within themselves, our own, and what ties them.
+    pub problem: MapProblem,
+    /// Frames that nothing ties to anything, and how many anchors each has: their odometry is all there is to say.
+    pub alone: BTreeMap<FrameId, usize>,
+}
+
 /// All facts held, parsed and indexed.
 #[derive(Clone, Debug, Default)]
 pub struct Knowledge {
-    submaps: BTreeMap<SubmapId, (EntryId, SubmapFact)>,
+    /// Boxed: a tree's nodes are half empty.
+    submaps: BTreeMap<SubmapId, Box<Known>>,
     alignments: BTreeMap<EntryId, AlignmentFact>,
     by_pair: BTreeMap<Pair, BTreeSet<EntryId>>,
     verdicts: BTreeMap<EntryId, BTreeMap<EntryId, VerdictFact>>,
@@ -48,7 +80,7 @@ impl Knowledge {
     /// ignored: they are signed, so they stay in the log as evidence, but they move nothing.
     pub fn absorb(&mut self, id: EntryId, fact: Fact) {
         match fact {
-            Fact::Submap(submap) => self.absorb_submap(id, submap),
+            Fact::Submap(submap) => self.absorb_submap(id, &submap),
             Fact::Alignment(alignment) => self.absorb_alignment(id, alignment),
             Fact::Verdict(verdict) => {
                 let alignment = verdict.alignment;
@@ -65,10 +97,19 @@ impl Knowledge {
     }
 
     /// Of two submaps that claim one index, the one written first counts, in whatever order they arrive.
-    fn absorb_submap(&mut self, id: EntryId, fact: SubmapFact) {
-        let submap = SubmapId { frame: id.frame, index: fact.index };
-        if self.submaps.get(&submap).is_none_or(|(first, _)| id < *first) {
-            self.submaps.insert(submap, (id, fact));
+    fn absorb_submap(&mut self, entry: EntryId, fact: &SubmapFact) {
+        let submap = SubmapId { frame: entry.frame, index: fact.index };
+        if self.submaps.get(&submap).is_none_or(|first| entry < first.entry) {
+            let known = Known {
+                entry,
+                stamps: fact.stamps,
+                t_prev_this: fact.odometry.pose,
+                extent: fact.extent,
+                blob: fact.blob,
+                scale: fact.scale,
+                summary: Summary::decode(&fact.summary).ok(),
+            };
+            self.submaps.insert(submap, Box::new(known));
         }
     }
 
@@ -83,19 +124,19 @@ impl Knowledge {
     }
 
     /// Every submap known.
-    pub fn submaps(&self) -> impl Iterator<Item = (SubmapId, &SubmapFact)> {
-        self.submaps.iter().map(|(id, (_, fact))| (*id, fact))
+    pub fn submaps(&self) -> impl Iterator<Item = (SubmapId, &Known)> {
+        self.submaps.iter().map(|(id, known)| (*id, &**known))
     }
 
     /// The submaps of one robot, of all its frames.
-    pub fn submaps_of(&self, robot: RobotId) -> impl Iterator<Item = (SubmapId, &SubmapFact)> {
+    pub fn submaps_of(&self, robot: RobotId) -> impl Iterator<Item = (SubmapId, &Known)> {
         let end = |epoch, index| SubmapId { frame: FrameId { robot, epoch }, index };
-        self.submaps.range(end(0, 0)..=end(u32::MAX, u32::MAX)).map(|(id, (_, fact))| (*id, fact))
+        self.submaps.range(end(0, 0)..=end(u32::MAX, u32::MAX)).map(|(id, known)| (*id, &**known))
     }
 
     /// One submap.
-    pub fn submap(&self, id: SubmapId) -> Option<&SubmapFact> {
-        self.submaps.get(&id).map(|(_, fact)| fact)
+    pub fn submap(&self, id: SubmapId) -> Option<&Known> {
+        self.submaps.get(&id).map(|known| &**known)
     }
 
     /// Every alignment stated.
@@ -165,18 +206,16 @@ impl Knowledge {
         }
     }
 
-    /// The estimation problem: every frame's unbroken chain of submaps, one agreed alignment per pair, all sightings.
-    pub fn problem(&self) -> MapProblem {
-        let mut frames: BTreeMap<FrameId, FrameChain> = BTreeMap::new();
-        for (id, (_, fact)) in &self.submaps {
-            let chain =
-                frames.entry(id.frame).or_insert_with(|| FrameChain { scale: fact.scale, odometry: Vec::new() });
-            if chain.odometry.len() == id.index as usize {
-                chain.odometry.push(fact.odometry);
-            }
+    /// The estimation problem: one agreed alignment per pair, all sightings, and the unbroken chain of submaps of every
+    /// frame they tie, and of `own`. `odometry` reads `t_prev_this` from a submap's entry.
+    pub fn question(&self, own: FrameId, odometry: impl Fn(EntryId) -> Option<PoseWithCovariance>) -> Question {
+        let mut alone: BTreeMap<FrameId, usize> = BTreeMap::new();
+        for id in self.submaps.keys() {
+            let len = alone.entry(id.frame).or_default();
+            *len += usize::from(*len == id.index as usize);
         }
-        frames.retain(|_, chain| !chain.odometry.is_empty());
-        let held = |id: SubmapId| frames.get(&id.frame).is_some_and(|c| (id.index as usize) < c.odometry.len());
+        alone.retain(|_, len| *len > 0);
+        let held = |id: SubmapId| alone.get(&id.frame).is_some_and(|len| (id.index as usize) < *len);
         let mut alignments: Vec<AgreedAlignment> = self
             .by_pair
             .iter()
@@ -186,7 +225,7 @@ impl Knowledge {
             .map(|(entry, fact)| AgreedAlignment { entry, i: fact.i, j: fact.j, t_i_j: self.measurement(entry, fact) })
             .collect();
         distortion::charge(&mut alignments);
-        let sightings = self
+        let sightings: Vec<AgreedAlignment> = self
             .sightings
             .iter()
             .filter(|(_, fact)| held(fact.i) && held(fact.j))
@@ -197,7 +236,17 @@ impl Knowledge {
                 t_i_j: Relative::Metric(fact.t_i_j),
             })
             .collect();
-        MapProblem { frames, alignments, sightings }
+        let ties = alignments.iter().chain(&sightings);
+        let tied: BTreeSet<FrameId> = ties.flat_map(|tie| [tie.i.frame, tie.j.frame]).chain([own]).collect();
+        let chain = |frame: FrameId| {
+            let len = alone.remove(&frame)?;
+            let anchor = |index| SubmapId { frame, index };
+            let known = self.submaps.range(anchor(0)..anchor(len as u32)).map(|(_, known)| known);
+            let odometry = known.clone().map_while(|known| odometry(known.entry)).collect();
+            Some((frame, FrameChain { scale: known.clone().next()?.scale, odometry }))
+        };
+        let frames = tied.into_iter().filter_map(chain).collect();
+        Question { problem: MapProblem { frames, alignments, sightings }, alone }
     }
 }
 
@@ -276,6 +325,11 @@ mod tests {
         Fact::Verdict(VerdictFact { alignment, outcome: VerdictOutcome::Measured { t_i_j, sigma: 0.01, support: 20 } })
     }
 
+    /// The problem of a robot that no fact is about.
+    fn problem(knowledge: &Knowledge) -> MapProblem {
+        knowledge.question(frame(9), |_| Some(pose(0.0, 1e-4))).problem
+    }
+
     /// Robots 1 and 2, one submap each, and what else they say.
     fn knowledge(facts: &[(EntryId, Fact)]) -> Knowledge {
         let mut knowledge = Knowledge::default();
@@ -290,10 +344,24 @@ mod tests {
         let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
         let alone = knowledge(std::slice::from_ref(&stated));
         assert_eq!(alone.agreement(stated.0), Agreement::Waiting);
-        assert!(alone.problem().alignments.is_empty());
+        assert!(problem(&alone).alignments.is_empty());
         let agreed = knowledge(&[stated.clone(), (entry(2, 1), verdict(stated.0, 3.03, 0.02))]);
         assert_eq!(agreed.agreement(stated.0), Agreement::Agreed);
-        assert_eq!(agreed.problem().alignments.len(), 1);
+        assert_eq!(problem(&agreed).alignments.len(), 1);
+    }
+
+    #[test]
+    fn a_frame_that_nothing_ties_is_no_part_of_the_problem() {
+        let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
+        let lone = (entry(3, 0), submap());
+        let agreed = knowledge(&[stated.clone(), (entry(2, 1), verdict(stated.0, 3.0, 0.02)), lone]);
+        let frames = |own| agreed.question(frame(own), |_| Some(pose(0.0, 1e-4)));
+        let asked = frames(9);
+        assert!(asked.problem.frames.keys().eq([frame(1), frame(2)].iter()));
+        assert_eq!(asked.alone, BTreeMap::from([(frame(3), 1)]));
+        let asked = frames(3);
+        assert_eq!(asked.problem.frames.len(), 3, "unless it is our own");
+        assert!(asked.alone.is_empty());
     }
 
     #[test]
@@ -310,7 +378,7 @@ mod tests {
         let third = (entry(3, 0), verdict(lie.0, 30.0, 0.02));
         let known = knowledge(&[lie.clone(), own, third]);
         assert_eq!(known.agreement(lie.0), Agreement::Waiting);
-        assert!(known.problem().alignments.is_empty());
+        assert!(problem(&known).alignments.is_empty());
         // A third party cannot state an alignment of others.
         let foreign = (entry(3, 0), alignment(1, 2, 3.0, 0.02));
         assert!(knowledge(&[foreign]).alignments().next().is_none());
@@ -320,7 +388,7 @@ mod tests {
     fn nobody_can_overstate_a_shared_measurement() {
         let bold = (entry(1, 1), alignment(1, 2, 3.0, 0.001));
         let sober = (entry(2, 1), verdict(bold.0, 3.01, 0.05));
-        let problem = knowledge(&[bold, sober]).problem();
+        let problem = problem(&knowledge(&[bold, sober]));
         let Relative::Metric(used) = problem.alignments[0].t_i_j else { panic!("metric") };
         assert!(used.covariance.sigmas()[0] >= 0.05);
     }
@@ -335,6 +403,6 @@ mod tests {
             backward.absorb(*id, fact.clone());
         }
         assert_eq!(forward.agreement(stated.0), backward.agreement(stated.0));
-        assert_eq!(format!("{:?}", forward.problem()), format!("{:?}", backward.problem()));
+        assert_eq!(problem(&forward), problem(&backward));
     }
 }

@@ -116,7 +116,7 @@ impl Agent {
                 break;
             }
             next_index += 1;
-            t_frame_anchor = Some(t_frame_anchor.unwrap_or_else(Se3::identity) * fact.odometry.pose);
+            t_frame_anchor = Some(t_frame_anchor.unwrap_or_else(Se3::identity) * fact.t_prev_this);
         }
         self.mapper.builder = SubmapBuilder::resume(self.config.submap.clone(), next_index, t_frame_anchor);
     }

@@ -14,6 +14,7 @@ pub mod job;
 mod knowledge;
 mod mapping;
 mod negotiation;
+mod shortlist;
 mod solving;
 mod stats;
 mod view;
@@ -396,15 +397,17 @@ impl Agent {
     fn relearn(&mut self) {
         self.knowledge = Knowledge::default();
         self.negotiation.clear_candidates();
-        self.replica.facts().for_each(|(id, fact)| self.knowledge.absorb(id, fact));
-        // Verdicts call for nothing but news, and these are old; submaps of others are met by each of ours.
-        let calls = |(id, fact): &(EntryId, Fact)| match fact {
-            Fact::Submap(_) => id.frame.robot == self.me.robot,
-            Fact::Verdict(_) => false,
-            Fact::Alignment(_) | Fact::Sighting(_) => true,
-        };
-        let facts: Vec<(EntryId, Fact)> = self.replica.facts().filter(calls).collect();
-        facts.iter().for_each(|(id, fact)| self.on_fact(*id, fact));
+        // What calls for something is heard once all is known; of submaps ours call for all pairs, verdicts for nothing
+        // but news, and these are old.
+        let mut calling = Vec::new();
+        for (id, fact) in self.replica.facts() {
+            if matches!(fact, Fact::Alignment(_) | Fact::Sighting(_)) {
+                calling.push((id, fact.clone()));
+            }
+            self.knowledge.absorb(id, fact);
+        }
+        calling.iter().for_each(|(id, fact)| self.on_fact(*id, fact));
+        self.note_all_candidates();
         self.map.dirty = true;
     }
 

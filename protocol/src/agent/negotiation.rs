@@ -7,6 +7,7 @@
 
 use super::io::{JobId, QueryId};
 use super::knowledge::{Pair, pair_of};
+use super::shortlist::{Candidate, Shortlist};
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::{Features, Keypoints};
 use crate::time::Instant;
@@ -34,19 +35,6 @@ pub const FETCHES_MAX: usize = 4;
 pub const FETCH_ATTEMPTS_MAX: u32 = 6;
 /// Longest pause between two attempts to fetch one blob.
 pub const FETCH_BACKOFF_MAX: Duration = Duration::from_secs(30);
-
-/// A pair worth trying.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Candidate {
-    /// Our submap.
-    pub mine: SubmapId,
-    /// The other one (a peer's, or ours for a loop).
-    pub theirs: SubmapId,
-    /// Similarity of the summaries, 0 to 1.
-    pub similarity: f64,
-    /// The other endpoint asked for it.
-    pub wished: bool,
-}
 
 /// What a running alignment is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -95,7 +83,7 @@ impl Fetch {
 pub struct Negotiation {
     features: BTreeMap<SubmapId, Arc<Features>>,
     keypoints: BTreeMap<Hash, Arc<Keypoints>>,
-    candidates: BTreeMap<Pair, Candidate>,
+    candidates: Shortlist,
     tried: BTreeSet<Pair>,
     tries: BTreeMap<(SubmapId, FrameId), usize>,
     /// Foreign alignments to answer.
@@ -108,8 +96,8 @@ pub struct Negotiation {
     pub running: BTreeMap<JobId, Work>,
     /// Something changed that may make work startable.
     stirred: bool,
-    /// Pairs we are not responsible for and would like to see tried, with their similarity.
-    pub wishes: BTreeMap<Pair, f64>,
+    /// Pairs we are not responsible for and would like to see tried.
+    pub wishes: Shortlist,
 }
 
 impl Negotiation {
@@ -170,38 +158,19 @@ impl Negotiation {
 
     /// Notes a pair that may overlap; the least similar beyond `limit` goes.
     pub fn add_candidate(&mut self, candidate: Candidate, limit: usize) {
-        let pair = pair_of(candidate.mine, candidate.theirs);
-        if self.tried.contains(&pair) || self.candidates.contains_key(&pair) {
-            return;
-        }
-        self.candidates.insert(pair, candidate);
-        if self.candidates.len() > limit {
-            let worst = self
-                .candidates
-                .iter()
-                .min_by(|a, b| a.1.similarity.total_cmp(&b.1.similarity).then(a.0.cmp(b.0)))
-                .map(|(pair, _)| *pair);
-            worst.map(|pair| self.candidates.remove(&pair));
+        if !self.tried.contains(&pair_of(candidate.mine, candidate.theirs)) {
+            self.candidates.offer(candidate, limit);
         }
     }
 
-    /// A candidate less similar than this would not be kept.
+    /// Neither among candidates nor among wishes would a pair less similar than this be kept.
     pub fn least_similarity(&self, limit: usize) -> f64 {
-        match self.candidates.len() < limit {
-            true => f64::NEG_INFINITY,
-            false => self.candidates.values().map(|c| c.similarity).fold(f64::INFINITY, f64::min),
-        }
+        self.candidates.least(limit).min(self.wishes.least(limit))
     }
 
     /// The other endpoint wishes this pair tried. False if it is unknown here.
     pub fn wish(&mut self, pair: Pair) -> bool {
-        match self.candidates.get_mut(&pair) {
-            Some(candidate) => {
-                candidate.wished = true;
-                true
-            }
-            None => false,
-        }
+        self.candidates.wish(pair)
     }
 
     /// Whether a pair has been tried.
@@ -211,7 +180,7 @@ impl Negotiation {
 
     /// Takes a pair off the list for good.
     pub fn mark_tried(&mut self, pair: Pair) {
-        if let Some(candidate) = self.candidates.remove(&pair) {
+        if let Some(candidate) = self.candidates.remove(pair) {
             *self.tries.entry((candidate.mine, candidate.theirs.frame)).or_default() += 1;
         }
         if self.tried.len() < TRIED_MAX {
@@ -225,7 +194,7 @@ impl Negotiation {
             .candidates
             .iter()
             .filter(|(_, c)| self.tries.get(&(c.mine, c.theirs.frame)).is_none_or(|&n| n < TRIES_PER_SUBMAP))
-            .filter_map(|(pair, c)| gain(c).map(|g| (g, *pair, *c)))
+            .filter_map(|(pair, c)| gain(c).map(|g| (g, pair, *c)))
             .collect();
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         ranked.into_iter().map(|(_, _, candidate)| candidate).collect()

@@ -3,24 +3,28 @@
 use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{Job, SolveJob, Solved};
-use crate::estimate::joint::JointEstimate;
-use crate::geometry::Relative;
-use crate::ids::{FrameId, Hash, SubmapId};
+use super::knowledge::Question;
+use crate::geometry::{PoseWithCovariance, Relative};
+use crate::ids::{EntryId, FrameId, Hash, SubmapId};
 use crate::time::Instant;
+use crate::wire::fact::Fact;
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 
 /// The joint estimate and the state of its solver.
 #[derive(Default)]
 pub(super) struct MapState {
-    pub(super) estimate: Option<Arc<JointEstimate>>,
-    /// `t_own_anchor` of every submap connected to our frame.
-    pub(super) anchors: BTreeMap<SubmapId, Relative>,
+    pub(super) solved: Solved,
+    /// Our frame when the estimate was posed, in which its views are given. A new epoch has another.
+    seen_from: Option<FrameId>,
+    /// Frames that the estimate passed over because nothing ties them to anything, and how many anchors each has.
+    pub(super) alone: BTreeMap<FrameId, usize>,
     /// Facts came in since the last problem was posed.
     pub(super) dirty: bool,
     pub(super) solving: Option<JobId>,
     posed_digest: Hash,
+    posed_from: Option<FrameId>,
+    posed_alone: BTreeMap<FrameId, usize>,
     /// Digest of the set of facts that the estimate is a function of.
     pub(super) digest: Hash,
     next_solve: Instant,
@@ -35,7 +39,10 @@ impl Agent {
     pub(super) fn start_solving(&mut self) {
         if self.map.dirty && self.map.solving.is_none() && self.now >= self.map.next_solve {
             let config = self.config.estimate.clone();
-            let job = SolveJob { problem: self.knowledge.problem(), config, own: self.me.frame };
+            let own = self.me.frame;
+            let Question { problem, alone } = self.knowledge.question(own, |entry| self.odometry(entry));
+            let job = SolveJob { problem, config, own };
+            (self.map.posed_from, self.map.posed_alone) = (Some(own), alone);
             self.map.dirty = false;
             self.map.posed_digest = self.replica.digest();
             self.map.next_solve = self.now.after(Duration::from_secs_f64(self.config.estimate.interval_secs));
@@ -47,11 +54,11 @@ impl Agent {
         if self.map.solving.take_if(|running| *running == job).is_none() {
             return;
         }
-        let Solved { estimate, anchors } = solved;
         self.map.digest = self.map.posed_digest;
-        let merged = self.frames_merged_with_ours(&estimate);
-        self.map.estimate = Some(estimate);
-        self.map.anchors = anchors;
+        self.map.seen_from = self.map.posed_from;
+        self.map.alone = core::mem::take(&mut self.map.posed_alone);
+        self.map.solved = solved;
+        let merged = self.frames_merged_with_ours();
         self.negotiation.stir();
         let before = core::mem::replace(&mut self.map.merged, merged.clone());
         for frame in merged.difference(&before) {
@@ -63,10 +70,31 @@ impl Agent {
     }
 
     /// Frames in the component of our present frame, without it.
-    pub(super) fn frames_merged_with_ours(&self, estimate: &JointEstimate) -> BTreeSet<FrameId> {
+    pub(super) fn frames_merged_with_ours(&self) -> BTreeSet<FrameId> {
         let own = self.me.frame;
-        let Some(component) = estimate.component_of(own) else { return BTreeSet::new() };
-        let frames: BTreeSet<FrameId> = self.knowledge.submaps().map(|(id, _)| id.frame).collect();
-        frames.into_iter().filter(|f| *f != own && estimate.component_of(*f) == Some(component)).collect()
+        let Some(ours) = self.map.solved.frames.get(&own).map(|placed| placed.with) else { return BTreeSet::new() };
+        let together = self.map.solved.frames.iter().filter(|(frame, placed)| **frame != own && placed.with == ours);
+        together.map(|(frame, _)| *frame).collect()
+    }
+
+    /// `t_own_frame`, if the estimate says so of our present frame.
+    pub(super) fn t_own_frame(&self, frame: FrameId) -> Option<Relative> {
+        self.solved_for_own()?.frames.get(&frame)?.t_own_frame
+    }
+
+    /// `t_own_anchor`, likewise.
+    pub(super) fn t_own_anchor(&self, submap: SubmapId) -> Option<&Relative> {
+        self.solved_for_own()?.anchors.get(&submap)
+    }
+
+    fn solved_for_own(&self) -> Option<&Solved> {
+        (self.map.seen_from == Some(self.me.frame)).then_some(&self.map.solved)
+    }
+
+    fn odometry(&self, entry: EntryId) -> Option<PoseWithCovariance> {
+        match self.replica.entry(entry)?.fact().ok()? {
+            Fact::Submap(fact) => Some(fact.odometry),
+            _ => None,
+        }
     }
 }

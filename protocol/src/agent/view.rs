@@ -16,11 +16,16 @@ use std::collections::{BTreeMap, BTreeSet};
 impl Agent {
     /// Everything this agent believes at `now`.
     pub fn snapshot(&self, now: Instant) -> Snapshot {
+        Snapshot { map: self.map_view(), ..self.overview(now) }
+    }
+
+    /// [`Agent::snapshot`] with an empty map: the map of a large swarm has tens of thousands of anchors.
+    pub fn overview(&self, now: Instant) -> Snapshot {
         Snapshot {
             status: self.status(),
             frames: self.frames_view(),
             poses: self.poses_view(now),
-            map: self.map_view(),
+            map: MapView { submaps: Vec::new() },
             graph: self.graph_view(),
             stats: self.stats_view(),
         }
@@ -60,8 +65,7 @@ impl Agent {
     }
 
     fn merged_with(&self) -> Vec<String> {
-        let Some(estimate) = &self.map.estimate else { return Vec::new() };
-        let robots: BTreeSet<RobotId> = self.frames_merged_with_ours(estimate).iter().map(|f| f.robot).collect();
+        let robots: BTreeSet<RobotId> = self.frames_merged_with_ours().iter().map(|f| f.robot).collect();
         let mut names: Vec<String> =
             robots.into_iter().filter(|r| *r != self.me.robot).map(|r| self.robot_name(r)).collect();
         names.sort();
@@ -73,44 +77,46 @@ impl Agent {
         for (id, _) in self.knowledge.submaps() {
             *submaps.entry(id.frame).or_default() += 1;
         }
-        let estimate = self.map.estimate.as_ref();
+        let components = self.components();
         let frames = submaps
             .into_iter()
             .map(|(frame, submaps)| FrameView {
                 frame: self.frame_name(frame),
                 robot: self.robot_name(frame.robot),
                 submaps,
-                component: estimate.and_then(|e| e.component_of(frame)).unwrap_or(usize::MAX) as u64,
+                component: components.get(&frame).map_or(u64::MAX, |number| *number),
                 t_own_frame: self.t_own_frame(frame).as_ref().map(RelationView::from),
             })
             .collect();
         FramesView { own: self.frame_name(self.me.frame), frames, pairs: self.pair_views() }
     }
 
-    fn t_own_frame(&self, frame: FrameId) -> Option<Relative> {
-        self.map.estimate.as_ref()?.frame(self.me.frame, frame)
+    /// Numbers the components by their smallest frames; frames with one number are connected.
+    fn components(&self) -> BTreeMap<FrameId, u64> {
+        let alone = self.map.alone.keys().map(|frame| (*frame, *frame));
+        let with: BTreeMap<FrameId, FrameId> =
+            self.map.solved.frames.iter().map(|(frame, placed)| (*frame, placed.with)).chain(alone).collect();
+        let smallest: BTreeSet<FrameId> = with.values().copied().collect();
+        let numbers: BTreeMap<FrameId, u64> = smallest.into_iter().zip(0..).collect();
+        with.into_iter().filter_map(|(frame, with)| Some((frame, *numbers.get(&with)?))).collect()
     }
 
     fn pair_views(&self) -> Vec<PairView> {
-        let Some(estimate) = &self.map.estimate else { return Vec::new() };
         let mut proposed: BTreeMap<(FrameId, FrameId), u64> = BTreeMap::new();
         for (_, fact) in self.knowledge.alignments() {
             *proposed.entry((fact.i.frame, fact.j.frame)).or_default() += 1;
         }
-        let pairs = estimate.pairs().iter();
+        let pairs = self.map.solved.pairs.iter();
         pairs
-            .map(|pair| {
-                let joint = estimate.frame(pair.a, pair.b);
-                PairView {
-                    a: self.frame_name(pair.a),
-                    b: self.frame_name(pair.b),
-                    status: pair.status,
-                    proposed: proposed.get(&(pair.a, pair.b)).copied().unwrap_or(0),
-                    agreed: pair.agreed as u64,
-                    used: pair.used as u64,
-                    log10_nfa: pair.log10_nfa,
-                    t_a_b: joint.as_ref().or(pair.t_a_b.as_ref()).map(RelationView::from),
-                }
+            .map(|pair| PairView {
+                a: self.frame_name(pair.a),
+                b: self.frame_name(pair.b),
+                status: pair.status,
+                proposed: proposed.get(&(pair.a, pair.b)).copied().unwrap_or(0),
+                agreed: pair.agreed as u64,
+                used: pair.used as u64,
+                log10_nfa: pair.log10_nfa,
+                t_a_b: pair.t_a_b.as_ref().map(RelationView::from),
             })
             .collect()
     }
@@ -137,7 +143,7 @@ impl Agent {
         age_secs: f64,
         stamp_secs: f64,
     ) -> RobotView {
-        let t_own_anchor = self.map.anchors.get(&anchor);
+        let t_own_anchor = self.t_own_anchor(anchor);
         let t_own_body = t_own_anchor.map(|t| t.compose(&Relative::Metric(*t_anchor_body)));
         RobotView {
             robot: self.robot_name(robot),
@@ -156,26 +162,24 @@ impl Agent {
             if frame.replace(id.frame) != Some(id.frame) {
                 t_frame_anchor = Se3::identity();
             }
-            t_frame_anchor = t_frame_anchor * fact.odometry.pose;
+            t_frame_anchor = t_frame_anchor * fact.t_prev_this;
             submaps.push(SubmapView {
                 frame: self.frame_name(id.frame),
                 robot: self.robot_name(id.frame.robot),
                 index: id.index,
                 stamps_secs: fact.stamps.map(crate::time::Stamp::as_secs_f64),
                 t_frame_anchor: PoseView::from(&t_frame_anchor),
-                t_own_anchor: self.map.anchors.get(&id).map(RelationView::from),
+                t_own_anchor: self.t_own_anchor(id).map(RelationView::from),
             });
         }
         MapView { submaps }
     }
 
     fn graph_view(&self) -> GraphView {
-        let Some(estimate) = &self.map.estimate else {
-            return GraphView { nodes: 0, chi2: 0.0, dof: 0, edges: self.unused_edges(&BTreeSet::new()) };
-        };
+        let solved = &self.map.solved;
         let mut edges = Vec::new();
         let mut listed = BTreeSet::new();
-        for edge in estimate.edges() {
+        for edge in &solved.edges {
             let measurement = &edge.measurement;
             listed.insert(measurement.entry);
             edges.push(EdgeView {
@@ -193,7 +197,8 @@ impl Agent {
             });
         }
         edges.extend(self.unused_edges(&listed));
-        GraphView { nodes: estimate.nodes as u64, chi2: estimate.chi2, dof: estimate.dof as u64, edges }
+        let nodes = solved.nodes + self.map.alone.values().sum::<usize>();
+        GraphView { nodes: nodes as u64, chi2: solved.chi2, dof: solved.dof as u64, edges }
     }
 
     /// Alignments that did not enter the estimate, with the reason.

@@ -15,6 +15,8 @@ use rand_chacha::rand_core::Rng;
 const PAIRED_POINTS: usize = 384;
 /// Random triangles drawn.
 const TRIANGLES: usize = 1024;
+/// Triangles measured together.
+const BATCH: usize = 64;
 /// Pairs of points, and triangles, within the smallest radius that counts as resolved.
 const RESOLVED_PAIRS: u32 = 64;
 const RESOLVED_TRIANGLES: u32 = 32;
@@ -179,13 +181,29 @@ fn count_triangles(
     if n < 3 {
         return;
     }
-    for _ in 0..TRIANGLES {
-        let [i, j, k] = distinct_three(n, rng);
-        let lengths = |p: &[Vector3<f64>]| [(p[i] - p[j]).norm(), (p[j] - p[k]).norm(), (p[k] - p[i]).norm()];
-        let (d, e) = (lengths(source), lengths(target));
-        let scale = ((e[0] + e[1] + e[2]) / (d[0] + d[1] + d[2]).max(1e-300)).clamp(low, high);
-        let worst = (0..3).map(|k| (scale * d[k] - e[k]).abs()).fold(0.0, f64::max) / unit;
-        counts[bin((worst * worst) as f32)] += 1;
+    // In batches by edge, so that roots and quotients vectorise.
+    let (mut source_edges, mut target_edges) = ([[0.0; BATCH]; 3], [[0.0; BATCH]; 3]);
+    let mut squared = [0.0_f32; BATCH];
+    for _ in 0..TRIANGLES / BATCH {
+        for t in 0..BATCH {
+            let v = distinct_three(n, rng);
+            for edge in 0..3 {
+                let (a, b) = (v[edge], v[(edge + 1) % 3]);
+                source_edges[edge][t] = (source[a] - source[b]).norm_squared();
+                target_edges[edge][t] = (target[a] - target[b]).norm_squared();
+            }
+        }
+        for t in 0..BATCH {
+            let d = [source_edges[0][t].sqrt(), source_edges[1][t].sqrt(), source_edges[2][t].sqrt()];
+            let e = [target_edges[0][t].sqrt(), target_edges[1][t].sqrt(), target_edges[2][t].sqrt()];
+            let scale = ((e[0] + e[1] + e[2]) / (d[0] + d[1] + d[2]).max(1e-300)).max(low).min(high);
+            let apart = |k: usize| (scale * d[k] - e[k]).abs();
+            let worst = apart(0).max(apart(1)).max(apart(2)) / unit;
+            squared[t] = (worst * worst) as f32;
+        }
+        for &squared in &squared {
+            counts[bin(squared)] += 1;
+        }
     }
 }
 
@@ -195,7 +213,10 @@ fn distinct_three(n: u64, rng: &mut ChaCha8Rng) -> [usize; 3] {
     let bits = rng.next_u64();
     let below = |shift: u32, n: u64| (((bits >> shift) & 0x1f_ffff) * n) >> 21;
     let i = below(0, n);
-    let j = (i + 1 + below(21, n - 1)) % n;
+    let mut j = i + 1 + below(21, n - 1);
+    if j >= n {
+        j -= n;
+    }
     let mut k = below(42, n - 2);
     for taken in [i.min(j), i.max(j)] {
         k += u64::from(k >= taken);

@@ -5,7 +5,7 @@ use super::Weighting;
 use super::evidence::{self, EXPONENT_MAX, SIGMA_SPAN};
 use super::noise::{self, Shapes};
 use super::prepare::Matches;
-use super::sigma::NormDensity;
+use super::sigma::{BinnedDensity, NormDensity};
 use super::solve::{self, Motion};
 use core::f64::consts::PI;
 use libm::{exp, log};
@@ -80,6 +80,7 @@ pub(super) struct Scratch {
     source_used: Vec<bool>,
     target_used: Vec<bool>,
     density: NormDensity,
+    binned: BinnedDensity,
     trial: Vec<f64>,
 }
 
@@ -261,13 +262,19 @@ fn kernel_density(context: &Context, start: &Fit, scratch: &mut Scratch) -> Opti
 
 /// Fills `order` with the matches within reach, nearest first, and the density with their residuals. Returns how many.
 fn gather(fit: &Fit, scratch: &mut Scratch) -> usize {
+    within_reach(fit, scratch);
+    let squared = &fit.squared;
+    scratch.density.set(scratch.order.iter().map(|&i| squared[i as usize].sqrt()));
+    scratch.order.len()
+}
+
+/// Fills `order` with the matches within reach, nearest first.
+fn within_reach(fit: &Fit, scratch: &mut Scratch) {
     let reach = KDE_REACH * KDE_REACH * fit.sigma * fit.sigma;
     let squared = &fit.squared;
     scratch.order.clear();
     scratch.order.extend((0..squared.len() as u32).filter(|&i| squared[i as usize] < reach));
     scratch.order.sort_unstable_by(|&a, &b| squared[a as usize].total_cmp(&squared[b as usize]).then(a.cmp(&b)));
-    scratch.density.set(scratch.order.iter().map(|&i| squared[i as usize].sqrt()));
-    scratch.order.len()
 }
 
 /// Density of an outlier's residual norm.
@@ -277,16 +284,17 @@ fn outlier_shell(r: f64, share: f64, volume: f64) -> f64 {
 
 /// Σ over residuals within reach of ln(kernel density, leave-one-out) − ln(Gaussian mixture, leave-one-out).
 fn held_out_gain(context: &Context, fit: &Fit, scratch: &mut Scratch) -> f64 {
-    let inside = gather(fit, scratch);
+    within_reach(fit, scratch);
     let n = fit.squared.len() as f64;
-    let spread = CHI3_SPREAD * fit.sigma;
+    let share = scratch.order.len() as f64 / n;
+    scratch.binned.set(scratch.order.iter().map(|&i| fit.squared[i as usize].sqrt()), CHI3_SPREAD * fit.sigma);
     let freedom = (3.0 * fit.support() - context.dof()).max(2.0);
     let volume = context.volume / fit.region();
     let mut gain = 0.0;
-    for (k, &i) in scratch.order.iter().enumerate() {
+    for &i in &scratch.order {
         let (r2, p) = (fit.squared[i as usize], fit.probabilities[i as usize]);
         let r = r2.sqrt();
-        let kernel = inside as f64 / n * scratch.density.at_sample(k, spread);
+        let kernel = share * scratch.binned.at_sample(r);
         // σ̂² without this match.
         let variance = fit.sigma * fit.sigma;
         let left = ((freedom * variance - p * r2) / (freedom - 3.0 * p).max(1.0)).max(0.1 * variance);

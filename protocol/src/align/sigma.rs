@@ -158,6 +158,88 @@ impl NormDensity {
     }
 }
 
+/// [`NormDensity::at_sample`] of every sample, with samples counted in bins of a quarter of the bandwidth: O(n) for all, and
+/// near enough to ask which of two densities predicts better (a sum of many logarithms: *measured* within 1 % a sample).
+#[derive(Clone, Debug, Default)]
+pub(super) struct BinnedDensity {
+    counts: Vec<f64>,
+    /// Mean kernel between two samples so many bins apart.
+    kernel: Vec<f64>,
+    /// Σ of the kernel over all samples, at each bin.
+    sums: Vec<f64>,
+    width: f64,
+    amplitude: f64,
+}
+
+impl BinnedDensity {
+    /// Bins a bandwidth.
+    const FINENESS: f64 = 4.0;
+    /// Two samples of bins so near each other are averaged over where they may be.
+    const NEAR: usize = 3;
+
+    /// Replaces the samples (norms, finite and ≥ 0).
+    pub fn set(&mut self, samples: impl ExactSizeIterator<Item = f64> + Clone, sigma_max: f64) {
+        let n = samples.len();
+        let kernel = Kernel::new(n.max(1), sigma_max);
+        self.width = (0.5 / kernel.precision).sqrt() / Self::FINENESS;
+        self.amplitude = kernel.amplitude / n.saturating_sub(1).max(1) as f64;
+        let reach = (ARGUMENT_MAX / kernel.precision).sqrt() / self.width;
+        self.kernel.clear();
+        let width = self.width;
+        self.kernel.extend((0..reach as usize + 2).map(|bins| Self::mean_kernel(&kernel, bins, width)));
+        let highest = samples.clone().fold(0.0, f64::max);
+        self.counts.clear();
+        self.counts.resize((highest / self.width) as usize + 1, 0.0);
+        for r in samples {
+            let bin = self.bin(r);
+            self.counts[bin] += 1.0;
+        }
+        self.sums.clear();
+        self.sums.resize(self.counts.len(), 0.0);
+        for (b, &count) in self.counts.iter().enumerate().filter(|(_, count)| **count > 0.0) {
+            for (sum, kernel) in self.sums[b..].iter_mut().zip(&self.kernel) {
+                *sum += count * kernel;
+            }
+            for (sum, kernel) in self.sums[..b].iter_mut().rev().zip(&self.kernel[1..]) {
+                *sum += count * kernel;
+            }
+            // Reflected: −b lies b + 1 bins below bin 0.
+            for (sum, kernel) in self.sums.iter_mut().zip(self.kernel.iter().skip(b + 1)) {
+                *sum += count * kernel;
+            }
+        }
+    }
+
+    /// Density at a sample `r`, of all others; 0 for fewer than 2 samples.
+    pub fn at_sample(&self, r: f64) -> f64 {
+        let bin = self.bin(r);
+        let own = self.kernel[0] + self.kernel.get(2 * bin + 1).copied().unwrap_or(0.0);
+        (self.amplitude * (self.sums[bin] - own)).max(0.0)
+    }
+
+    fn bin(&self, r: f64) -> usize {
+        ((r / self.width) as usize).min(self.counts.len() - 1)
+    }
+
+    /// Over both samples anywhere in their bins.
+    fn mean_kernel(kernel: &Kernel, bins: usize, width: f64) -> f64 {
+        let at = |apart: f64| e1_fast(kernel.argument(apart * width));
+        let middle = bins as f64;
+        if bins > Self::NEAR {
+            return at(middle);
+        }
+        // Midpoints of the triangular density of their distance.
+        let (mut sum, mut total) = (0.0, 0.0);
+        for k in 0..16 {
+            let off = (f64::from(k) - 7.5) / 8.0;
+            let weight = 1.0 - off.abs();
+            sum += weight * at(middle + off);
+            total += weight;
+        }
+        sum / total
+    }
+}
+
 /// Kernel between norms r and s, and between r and the reflected −s.
 fn pair(kernel: &Kernel, r: f64, s: f64) -> f64 {
     e1_fast(kernel.argument(r - s)) + e1_fast(kernel.argument(r + s))
@@ -197,6 +279,7 @@ fn e1_table() -> Vec<[f64; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rand_chacha::rand_core::{Rng, SeedableRng};
 
     #[test]
     fn e1_matches_reference_values() {
@@ -296,6 +379,31 @@ mod tests {
         assert!((density.at(0.6, 0.8) / both(0.6, &samples) - 1.0).abs() < 1e-6);
         density.set([0.4].into_iter());
         assert_eq!((density.at_sample(0, 1.0), density.at(0.4, 1.0), density.len()), (0.0, 0.0, 1));
+    }
+
+    #[test]
+    fn bins_predict_as_well_as_the_direct_sum() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+        for n in [20, 100, 400] {
+            let (mut sum, rounds) = (0.0, 30);
+            for _ in 0..rounds {
+                let mut unit = || (rng.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
+                let samples: Vec<f64> = (0..n).map(|_| 0.01 * (-2.0 * log(1.0 - unit())).sqrt()).collect();
+                let (mut exact, mut binned) = (NormDensity::default(), BinnedDensity::default());
+                exact.set(samples.iter().copied());
+                binned.set(samples.iter().copied(), 0.007);
+                sum += (0..samples.len())
+                    .map(|i| (binned.at_sample(samples[i]), exact.at_sample(i, 0.007)))
+                    .filter(|(a, b)| *a > 0.0 && *b > 0.0)
+                    .map(|(a, b)| log(a / b))
+                    .sum::<f64>();
+            }
+            let bias = sum / f64::from(n * rounds);
+            assert!(bias.abs() < 0.02, "n = {n}: {bias}");
+        }
+        let mut binned = BinnedDensity::default();
+        binned.set([0.4].into_iter(), 1.0);
+        assert_eq!(binned.at_sample(0.4), 0.0);
     }
 
     #[test]

@@ -6,8 +6,9 @@
 //! squares with cross-covariances, and a leave-one-out χ² test, marginalised over the scale, that drops what the others
 //! do not predict. The settled sets are candidates of an explanation: one set that speaks of one transform, or two that
 //! speak of two, by σ-marginalised evidence of their stacked residuals. Frames merge at a number of false alarms (NFA)
-//! < 1e-4 and 3 alignments, unless a second set has about as many members as the first. Same set of alignments, same
-//! answer to the bit, in any order.
+//! < 1e-4 and 3 alignments beyond doubt, unless a second set has about as many members as the first. A doubtful alignment
+//! is not used, and where the answer hangs on it the frames do not merge. Same set of alignments, same answer to the bit, in
+//! any order.
 //!
 //! *Measured* by `merganser-sim bench frames` over thousands of worlds: 4 true alignments against 3 of one lie merge
 //! rightly in 99.1 to 99.8 %, 4 against 4 are ambiguous in 99.9 to 100 %. The NFA alone, without evidence, reaches 97 and
@@ -15,6 +16,7 @@
 
 mod clique;
 mod decide;
+mod doubt;
 mod evidence;
 mod explain;
 mod gls;
@@ -59,7 +61,8 @@ pub struct FrameConsensusConfig {
     /// Largest factor by which true standard deviations may exceed the stated ones.
     pub covariance_scale_max: f64,
     /// Least edge of the box in which a false alignment may fall, in frame units; trajectories longer than that enlarge
-    /// it. Choose the reach of an alignment: about a submap's diameter.
+    /// it. Also the length beside which it is small what doubtful alignments may move. Choose the reach of an alignment: about a
+    /// submap's diameter.
     pub search_edge_min: f64,
     /// How a false alignment may be turned.
     pub rotations: Rotations,
@@ -81,7 +84,7 @@ pub enum FrameOutcome<T = PoseWithCovariance> {
     None,
     /// Enough alignments agree: the frames are one.
     Merged(FrameConsensus<T>),
-    /// What there is agrees, but it is too little to merge on: to show, not to use.
+    /// What there is agrees, but it is too little to merge on, or hangs on one that may be false: to show, not to use.
     Provisional(FrameConsensus<T>),
     /// Two disjoint sets of alignments contradict each other and do about equally well.
     Ambiguous {

@@ -154,17 +154,26 @@ impl Intake {
         self.edges.iter_mut().filter(stray).for_each(|e| e.refuse(Unused::Unmerged(PairStatus::Provisional)));
     }
 
-    /// Lets in the sightings that agree with the map so far; whether there are any.
-    pub(super) fn admit_sightings(&mut self, relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>) -> bool {
+    /// Lets in the sightings and waiting alignments that agree with the map so far, the latter with the standard
+    /// deviations their pair was found to need; whether there are any.
+    pub(super) fn admit(
+        &mut self,
+        sigma_scales: &BTreeMap<(FrameId, FrameId), f64>,
+        relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>,
+    ) -> bool {
         let mut any = false;
-        let waiting = |e: &&mut EdgeEstimate| {
-            e.kind == Kind::Sighting && matches!(e.unused, Some(Unused::Unmerged(PairStatus::Provisional)))
+        let waiting = |e: &&mut EdgeEstimate| match e.kind {
+            Kind::Sighting => matches!(e.unused, Some(Unused::Unmerged(PairStatus::Provisional))),
+            Kind::Alignment => matches!(e.unused, Some(Unused::Waiting | Unused::Unmerged(PairStatus::Provisional))),
         };
         for edge in self.edges.iter_mut().filter(waiting) {
-            let Some(predicted) = relative(edge.measurement.i, edge.measurement.j) else { continue };
-            let distance = predicted.disagreement(&edge.measurement.t_i_j);
+            let (i, j) = (edge.measurement.i, edge.measurement.j);
+            let Some(predicted) = relative(i, j) else { continue };
+            let pair = (i.frame.min(j.frame), i.frame.max(j.frame));
+            let scale = sigma_scales.get(&pair).copied().unwrap_or(1.0);
+            let distance = predicted.disagreement(&edge.measurement.t_i_j.widened(scale));
             if distance.is_consistent() {
-                (edge.weight, edge.unused) = (1.0, None);
+                (edge.weight, edge.unused) = (1.0 / (scale * scale), None);
                 any = true;
             } else {
                 edge.refuse(Unused::Contradicts(distance.distance_squared));

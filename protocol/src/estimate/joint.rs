@@ -6,7 +6,7 @@
 //!    forest; a pair that contradicts a loop of frames (χ², 99.99 %) is left out.
 //! 3. Here, the whole graph is solved with the alignments that remain; one whose leave-one-out χ² exceeds 99.9 % is
 //!    dropped, the largest first, and the graph solved again.
-//! 4. Sightings between merged frames join if they pass the same test.
+//! 4. Sightings between merged frames, and alignments that no consensus weighed, join if they agree with that map.
 
 use super::graph::{Factor, Graph, Label};
 use super::intake::{Intake, Kind};
@@ -85,6 +85,9 @@ pub enum Unused {
     /// Its two frames are not merged.
     #[error("its frames are not merged ({0:?})")]
     Unmerged(PairStatus),
+    /// Its pair has more alignments than its consensus weighs; it counts once the map agrees with it.
+    #[error("waits for a map that tells where its frames lie")]
+    Waiting,
     /// The frame-level consensus of its pair leaves it out.
     #[error("contradicts the other alignments of its pair of frames")]
     Outvoted,
@@ -177,7 +180,8 @@ pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate
     let start = pairs::start(&intake, &pairs);
     let mut map = Map::solve(&mut intake, &mut pairs, start, config);
     let unknown_scale = intake.unknown_scale.clone();
-    if intake.admit_sightings(|i, j| map.relative(&unknown_scale, i, j)) {
+    let scales = pairs::sigma_scales(&pairs);
+    if intake.admit(&scales, |i, j| map.relative(&unknown_scale, i, j)) {
         map = Map::solve(&mut intake, &mut pairs, map.start, config);
     }
     JointEstimate::new(intake, pairs, map)

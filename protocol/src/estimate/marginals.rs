@@ -1,8 +1,9 @@
 //! Covariances of a solved component: of any anchor relative to any other, cross-correlations kept.
 //!
 //! With `T = X_i⁻¹ X_j` and local perturbations, `δ_T = δ_j − Ad(T⁻¹) δ_i`, so that `Σ_T = A H⁻¹ Aᵀ` for the sparse row
-//! block A of that expression: seven solves per pair. All anchors relative to one take seven solves and one selected
-//! inversion (MATH §3: joint covariances, never sums of marginals).
+//! block A of that expression: the inner products of `L⁻¹ Aᵀ`, in which only the way to the root takes part. All
+//! anchors relative to one take seven solves and one selected inversion (MATH §3: joint covariances, never sums of
+//! marginals).
 
 use super::solve::Solution;
 use super::sparse::SelectedInverse;
@@ -11,6 +12,7 @@ use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWi
 use crate::ids::{FrameId, SubmapId};
 use nalgebra::Matrix6;
 use std::collections::BTreeSet;
+use std::ops::Range;
 
 /// Standard deviation stated for relations that are certain by definition (an anchor in itself).
 const SIGMA_CERTAIN: f64 = 1e-9;
@@ -64,17 +66,17 @@ impl Solution {
     pub(super) fn covariance_between(&self, a: usize, b: usize) -> Option<Matrix7> {
         let t_b_a = self.values[b].inverse() * self.values[a];
         let rows = self.difference(a, b, &t_b_a.adjoint());
-        let columns = self.columns_of(&rows)?;
-        let mut out = Matrix7::zeros();
-        for (scalar, row) in &rows {
-            for c in 0..7 {
-                let x = columns[c * self.pattern.scalars() + scalar];
-                for r in 0..7 {
-                    out[(r, c)] += row[r] * x;
-                }
-            }
-        }
-        Some((out + out.transpose()) * 0.5)
+        let n = self.pattern.scalars();
+        let mut half = spread(&rows, n);
+        let touched = self.pattern.solve_upwards(&self.factor, rows.iter().map(|(scalar, _)| *scalar), &mut half);
+        let dot = |r: usize, c: usize| {
+            let (x, y) = (&half[r * n..(r + 1) * n], &half[c * n..(c + 1) * n]);
+            let over =
+                |range: &Range<usize>| x[range.clone()].iter().zip(&y[range.clone()]).map(|(x, y)| x * y).sum::<f64>();
+            touched.iter().map(over).sum::<f64>()
+        };
+        let lower = Matrix7::from_fn(|r, c| if r >= c { dot(r, c) } else { 0.0 });
+        Some(Matrix7::from_fn(|r, c| lower[(r.max(c), r.min(c))]))
     }
 
     /// [`Solution::covariance_between`] for two anchors that a factor ties, from the selected inverse instead of solves.
@@ -124,13 +126,7 @@ impl Solution {
 
     /// `H⁻¹ Aᵀ`, seven columns.
     fn columns_of(&self, rows: &[(usize, Vector7)]) -> Option<Vec<f64>> {
-        let n = self.pattern.scalars();
-        let mut columns = vec![0.0; 7 * n];
-        for (scalar, row) in rows {
-            for c in 0..7 {
-                columns[c * n + scalar] = row[c];
-            }
-        }
+        let mut columns = spread(rows, self.pattern.scalars());
         self.pattern.solve(&self.factor, &mut columns);
         Some(columns)
     }
@@ -160,6 +156,17 @@ impl Solution {
         out[6] = self.graph.scale_of(node).map(|s| (self.graph.nodes().len() - 1 + s, 0));
         out
     }
+}
+
+/// `Aᵀ` of `n` rows from its rows that are not zero, column by column.
+fn spread(rows: &[(usize, Vector7)], n: usize) -> Vec<f64> {
+    let mut columns = vec![0.0; 7 * n];
+    for (scalar, row) in rows {
+        for c in 0..7 {
+            columns[c * n + scalar] = row[c];
+        }
+    }
+    columns
 }
 
 /// The identity, with the smallest covariance that can be stated.

@@ -17,12 +17,18 @@ use crate::ids::{FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use std::collections::BTreeMap;
 
+/// Alignments of one pair that its consensus weighs against one another. More say little more about the frames, and
+/// cost the cube of their number; the others wait for the map, which tells the good ones better than a pair could.
+const WEIGHED_MAX: usize = 32;
+
 /// A pair of frames, `a < b`, and what its own alignments say.
 pub(super) struct Pair {
     pub(super) a: FrameId,
     pub(super) b: FrameId,
     /// Its alignments among the intake's edges.
     members: Vec<usize>,
+    /// Those among them that the consensus weighed.
+    weighed: Vec<usize>,
     outcome: Outcome,
     contradicts_loop: bool,
     /// Part of the spanning forest.
@@ -52,8 +58,9 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
         }
     }
     let pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
-        let outcome = decide(intake, (a, b), &members, config);
-        Pair { a, b, members, outcome, contradicts_loop: false, in_tree: false }
+        let weighed = spread(&members);
+        let outcome = decide(intake, (a, b), &weighed, config);
+        Pair { a, b, members, weighed, outcome, contradicts_loop: false, in_tree: false }
     };
     let mut pairs: Vec<Pair> = members.into_iter().map(pair).collect();
     for pair in &pairs {
@@ -98,8 +105,12 @@ pub(super) fn demote(intake: &mut Intake, pairs: &mut [Pair], alignments_min: us
 impl Pair {
     /// Sets weights and reasons of the pair's alignments after the consensus.
     fn mark(&self, intake: &mut Intake) {
-        for (k, &edge) in self.members.iter().enumerate() {
+        for &edge in &self.members {
+            intake.edges[edge].refuse(Unused::Waiting);
+        }
+        for (k, &edge) in self.weighed.iter().enumerate() {
             let edge = &mut intake.edges[edge];
+            edge.unused = None;
             if self.outcome.status != PairStatus::Merged {
                 edge.refuse(Unused::Unmerged(self.outcome.status));
             } else if self.outcome.used.contains(&k) {
@@ -134,6 +145,18 @@ impl Pair {
             contradicts_loop: self.contradicts_loop,
         }
     }
+}
+
+/// At most [`WEIGHED_MAX`] of a pair's alignments, evenly from first to last in canonical order.
+fn spread(members: &[usize]) -> Vec<usize> {
+    let kept = members.len().min(WEIGHED_MAX);
+    (0..kept).map(|k| members[k * members.len() / kept]).collect()
+}
+
+/// By pair of merged frames: by how much the standard deviations of its alignments are to be grown.
+pub(super) fn sigma_scales(pairs: &[Pair]) -> BTreeMap<(FrameId, FrameId), f64> {
+    let merged = pairs.iter().filter(|p| p.outcome.status == PairStatus::Merged);
+    merged.map(|p| ((p.a, p.b), p.outcome.sigma_scale)).collect()
 }
 
 /// Takes merged pairs into the forest, the strongest first, and leaves out those that contradict a loop.

@@ -49,6 +49,17 @@ impl Relative {
         }
     }
 
+    /// The same with all standard deviations grown by a factor.
+    pub fn widened(&self, sigma_scale: f64) -> Self {
+        let k = sigma_scale * sigma_scale;
+        match self {
+            Self::Metric(p) => Self::Metric(PoseWithCovariance { pose: p.pose, covariance: p.covariance.scaled(k) }),
+            Self::Similarity(s) => {
+                Self::Similarity(SimWithCovariance { sim: s.sim, covariance: s.covariance.scaled(k) })
+            }
+        }
+    }
+
     /// The rigid measurement, where it is one.
     pub fn metric(&self) -> Option<&PoseWithCovariance> {
         match self {

@@ -14,8 +14,9 @@ pub(super) struct Held {
 }
 
 impl Held {
-    pub fn new(entry: &Entry, bytes: &[u8]) -> Self {
-        Self { bytes: bytes.into(), hash: Hash::of(bytes), floor: entry.floor(), durable: false }
+    /// An entry from its canonical bytes and the floor it states.
+    pub fn new(bytes: Box<[u8]>, floor: u32) -> Self {
+        Self { hash: Hash::of(&bytes), bytes, floor, durable: false }
     }
 }
 
@@ -63,11 +64,11 @@ impl Log {
         self.entries.last().map_or(0, |held| held.floor)
     }
 
-    /// Whether `entry`, whose place is the next free one, may be pushed.
-    pub fn link(&self, entry: &Entry) -> Link {
-        if entry.previous() != self.head() {
+    /// Whether an entry, whose place is the next free one, may be pushed that names this predecessor and this floor.
+    pub fn link(&self, previous: Hash, floor: u32) -> Link {
+        if previous != self.head() {
             Link::Contradicts
-        } else if entry.floor() < self.floor() {
+        } else if floor < self.floor() {
             Link::FloorFell
         } else {
             Link::Fits

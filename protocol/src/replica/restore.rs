@@ -3,10 +3,24 @@
 
 use super::log::{Held, Link};
 use super::set::{IngestError, Ingested, Replica};
-use crate::ids::{EntryId, FrameId};
+use crate::ids::{EntryId, FrameId, Hash};
 use crate::wire::Entry;
 use std::collections::BTreeMap;
 use thiserror::Error;
+
+/// A record, and what its place in the log depends on.
+struct Stored {
+    seq: u32,
+    previous: Hash,
+    floor: u32,
+    bytes: Vec<u8>,
+}
+
+impl Stored {
+    fn new(entry: &Entry, bytes: Vec<u8>) -> Self {
+        Self { seq: entry.id().seq, previous: entry.previous(), floor: entry.floor(), bytes }
+    }
+}
 
 /// A stored entry that could not be loaded.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,10 +54,10 @@ impl Replica {
     /// [`RestoreError`] lists what could not be loaded; everything else was.
     pub fn restore(&mut self, records: impl IntoIterator<Item = Vec<u8>>) -> Result<(), RestoreError> {
         let mut damaged = Vec::new();
-        let mut logs: BTreeMap<FrameId, Vec<(Entry, Vec<u8>)>> = BTreeMap::new();
+        let mut logs: BTreeMap<FrameId, Vec<Stored>> = BTreeMap::new();
         for bytes in records {
             match self.admit(&bytes) {
-                Ok(entry) => logs.entry(entry.id().frame).or_default().push((entry, bytes)),
+                Ok(entry) => logs.entry(entry.id().frame).or_default().push(Stored::new(&entry, bytes)),
                 Err(why) => {
                     let id = Entry::decode(&bytes).ok().map(|entry| entry.id());
                     damaged.push(Damage { id, why: Some(why) });
@@ -51,20 +65,19 @@ impl Replica {
             }
         }
         for (frame, mut records) in logs {
-            records.sort_by(|(a, x), (b, y)| (a.id().seq, x).cmp(&(b.id().seq, y)));
-            records.dedup_by(|(_, x), (_, y)| x == y);
+            records.sort_by(|x, y| (x.seq, &x.bytes).cmp(&(y.seq, &y.bytes)));
+            records.dedup_by(|x, y| x.bytes == y.bytes);
             self.restore_log(frame, records, &mut damaged);
         }
         damaged.sort_by_key(|damage| damage.id);
         if damaged.is_empty() { Ok(()) } else { Err(RestoreError { damaged }) }
     }
 
-    fn restore_log(&mut self, frame: FrameId, records: Vec<(Entry, Vec<u8>)>, damaged: &mut Vec<Damage>) {
-        let chained = self.restore_chain(frame, &records);
+    fn restore_log(&mut self, frame: FrameId, records: Vec<Stored>, damaged: &mut Vec<Damage>) {
         // What does not chain goes the long way: it may prove a fork, wait for a refetched entry, or be damaged.
-        for (entry, bytes) in &records[chained..] {
-            let id = Some(entry.id());
-            match self.ingest(bytes) {
+        for Stored { seq, bytes, .. } in self.restore_chain(frame, records) {
+            let id = Some(EntryId { frame, seq });
+            match self.ingest(&bytes) {
                 Ok(Ingested::New(ids)) => ids.into_iter().for_each(|id| self.mark_durable(id)),
                 Ok(Ingested::Known) | Err(IngestError::Fork(_) | IngestError::Quarantined(_)) => {}
                 Ok(Ingested::Early(_)) | Err(IngestError::TooEarly(_)) => damaged.push(Damage { id, why: None }),
@@ -73,30 +86,39 @@ impl Replica {
         }
     }
 
-    /// Loads the longest sound prefix of the log; returns how many records it took.
-    fn restore_chain(&mut self, frame: FrameId, records: &[(Entry, Vec<u8>)]) -> usize {
+    /// Loads the longest sound prefix of the log; gives back the other records.
+    fn restore_chain(&mut self, frame: FrameId, records: Vec<Stored>) -> Vec<Stored> {
         if self.slots.contains_key(&frame) || self.check_epoch(frame).is_err() {
-            return 0;
+            return records;
         }
-        for (entry, bytes) in records {
-            let log = self.log_mut(frame);
-            let next = entry.id().seq == log.next_seq() && matches!(log.link(entry), Link::Fits);
-            if !next || self.check_seq(entry.id()).is_err() {
+        let mut records = records.into_iter().peekable();
+        let fits = |replica: &mut Self, record: &Stored| {
+            let log = replica.log_mut(frame);
+            let next = record.seq == log.next_seq() && matches!(log.link(record.previous, record.floor), Link::Fits);
+            next && replica.check_seq(EntryId { frame, seq: record.seq }).is_ok()
+        };
+        while let Some(record) = records.next_if(|record| fits(self, record)) {
+            self.log_mut(frame).entries.push(Held::new(record.bytes.into(), record.floor));
+        }
+        let mut left = Vec::new();
+        while let Some(held) = self.log_mut(frame).entries.pop() {
+            let entry = Entry::decode(&held.bytes);
+            if entry.as_ref().is_ok_and(|entry| self.verify(entry).is_ok()) {
+                self.log_mut(frame).entries.push(held);
                 break;
             }
-            self.log_mut(frame).entries.push(Held::new(entry, bytes));
+            // What was admitted can be decoded again.
+            left.extend(entry.map(|entry| Stored::new(&entry, held.bytes.into())));
         }
-        let mut len = self.log_mut(frame).entries.len();
-        while len > 0 && self.verify(&records[len - 1].0).is_err() {
-            len -= 1;
-        }
+        left.reverse();
         let log = self.log_mut(frame);
-        log.entries.truncate(len);
-        (0..len as u32).for_each(|seq| log.mark_durable(seq));
+        log.entries.shrink_to_fit();
+        let len = log.next_seq();
+        (0..len).for_each(|seq| log.mark_durable(seq));
         self.digest.take();
         if len == 0 {
             self.slots.remove(&frame);
         }
-        len
+        left.into_iter().chain(records).collect()
     }
 }

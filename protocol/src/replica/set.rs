@@ -211,7 +211,7 @@ impl Replica {
         let (kind, payload) = (fact.kind(), fact.to_payload()?);
         let id = EntryId { frame, seq };
         let entry = Entry::sign(key, EntryContent { swarm: self.swarm, id, kind, floor, previous, payload })?;
-        self.log_mut(frame).entries.push(Held::new(&entry, &entry.encode()));
+        self.log_mut(frame).entries.push(Held::new(entry.encode().into(), entry.floor()));
         Ok(entry)
     }
 
@@ -377,12 +377,12 @@ impl Replica {
     /// Pushes a verified entry whose place is the next free one.
     fn push(&mut self, entry: Entry, bytes: &[u8]) -> Result<(), IngestError> {
         let id = entry.id();
-        let link = self.log(id.frame).map_or(Link::Fits, |log| log.link(&entry));
+        let link = self.log(id.frame).map_or(Link::Fits, |log| log.link(entry.previous(), entry.floor()));
         match link {
             Link::Fits => {
                 let log = self.log_mut(id.frame);
                 log.received = true;
-                log.entries.push(Held::new(&entry, bytes));
+                log.entries.push(Held::new(bytes.into(), entry.floor()));
                 Ok(())
             }
             Link::FloorFell => Err(IngestError::FloorFell(id)),

@@ -29,6 +29,9 @@ const VOXEL_RANGE: core::ops::RangeInclusive<f32> = 1e-4..=1e3;
 /// Summaries of clouds thinned to voxels that differ by more than this factor describe different things.
 const VOXEL_RATIO_MAX: f64 = 1.5;
 
+/// Keeps a pair that is just alike enough from being passed over for a rounding error.
+const ROUNDING: f64 = 1.0 - 1e-9;
+
 /// What is gossiped of a submap's looks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Summary {
@@ -36,6 +39,8 @@ pub struct Summary {
     voxel: f32,
     /// Square roots of the words' shares, the largest 255; all zero for an empty submap.
     words: [u8; WORDS],
+    /// Sum of the words' squares.
+    square: u32,
 }
 
 /// Why bytes are no summary.
@@ -70,28 +75,33 @@ impl Summary {
         }
         let most = f64::from(counts.iter().copied().max().unwrap_or(0).max(1));
         let words = counts.map(|count| (255.0 * (f64::from(count) / most).sqrt()).round() as u8);
-        Self { voxel: features.voxel() as f32, words }
+        Self::new(features.voxel() as f32, words)
+    }
+
+    fn new(voxel: f32, words: [u8; WORDS]) -> Self {
+        Self { voxel, words, square: dot(&words, &words) }
     }
 
     /// How alike two submaps look: 0 (nothing in common, or thinned to different voxels) to 1 (equal). Symmetric. Real
     /// submaps of one kind of place lie between 0.6 and 0.9.
     pub fn similarity(&self, other: &Self) -> f64 {
-        let ratio = f64::from(self.voxel) / f64::from(other.voxel);
-        if !(1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio) {
-            return 0.0;
-        }
-        let norm = (f64::from(self.dot(self)) * f64::from(other.dot(other))).sqrt();
-        if norm > 0.0 {
-            let bhattacharyya = (f64::from(self.dot(other)) / norm).clamp(0.0, 1.0);
-            1.0 - (1.0 - bhattacharyya).sqrt()
-        } else {
-            0.0
-        }
+        self.similarity_from(other, 0.0).unwrap_or(0.0)
     }
 
-    /// Exact in 32 bits, and a loop that vectorises: this runs for every pair of submaps.
-    fn dot(&self, other: &Self) -> u32 {
-        self.words.iter().zip(&other.words).map(|(&a, &b)| u32::from(a) * u32::from(b)).sum()
+    /// [`Summary::similarity`], unless it is below `least`. Most pairs of a large swarm are, and no root is drawn then.
+    pub fn similarity_from(&self, other: &Self, least: f64) -> Option<f64> {
+        let dot = f64::from(dot(&self.words, &other.words));
+        let squares = f64::from(self.square) * f64::from(other.square);
+        // 1 − √(1 − dot/√squares) ≥ least, solved for dot².
+        let bound = 1.0 - (1.0 - least) * (1.0 - least);
+        let surely_below = dot * dot < bound * bound * squares * ROUNDING;
+        let ratio = f64::from(self.voxel) / f64::from(other.voxel);
+        if surely_below || squares == 0.0 || !(1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio) {
+            return (least <= 0.0).then_some(0.0);
+        }
+        let bhattacharyya = (dot / squares.sqrt()).clamp(0.0, 1.0);
+        let similarity = 1.0 - (1.0 - bhattacharyya).sqrt();
+        (similarity >= least).then_some(similarity)
     }
 
     /// The summary as bytes, at most [`SUMMARY_LEN_MAX`].
@@ -121,8 +131,13 @@ impl Summary {
         if !VOXEL_RANGE.contains(&voxel) || !scaled {
             return Err(SummaryError::NotCanonical);
         }
-        Ok(Self { voxel, words })
+        Ok(Self::new(voxel, words))
     }
+}
+
+/// Exact in 32 bits, and a loop that vectorises: this runs for every pair of submaps.
+fn dot(a: &[u8; WORDS], b: &[u8; WORDS]) -> u32 {
+    a.iter().zip(b).map(|(&a, &b)| u32::from(a) * u32::from(b)).sum()
 }
 
 /// Fixed projections: in each of the three histograms five bins count 1, five −1 and one 0, so that the sign compares one

@@ -14,9 +14,22 @@ fn a_summary_survives_the_wire_and_is_most_like_itself() {
 }
 
 #[test]
+fn a_similarity_below_what_is_wanted_is_not_told_and_one_that_is_not_is() {
+    let (a, b) = (room(1).summary, room(2).summary);
+    let similarity = a.similarity(&b);
+    for least in [0.0, similarity / 2.0, similarity] {
+        assert_eq!(a.similarity_from(&b, least), Some(similarity));
+    }
+    for least in [similarity + 1e-12, similarity + 0.1, 1.0] {
+        assert_eq!(a.similarity_from(&b, least), None);
+    }
+    assert_eq!(a.similarity_from(&a, 1.0), Some(1.0));
+}
+
+#[test]
 fn empty_submaps_and_other_scales_are_like_nothing() {
     let a = room(1).summary;
-    let empty = Summary { voxel: a.voxel, words: [0; WORDS] };
+    let empty = Summary::new(a.voxel, [0; WORDS]);
     assert_eq!((empty.similarity(&empty), empty.similarity(&a)), (0.0, 0.0));
     let with_voxel = |factor: f32| {
         let mut scaled = a.clone();

@@ -2,7 +2,7 @@
 
 use merganser_protocol::estimate::frames::world::{Draw, SimWorld, World};
 use merganser_protocol::estimate::frames::{
-    FrameConsensusConfig, FrameOutcome, SimMeasurement, align_frames, align_frames_sim,
+    FrameConsensusConfig, FrameOutcome, PairAlignment, SimMeasurement, align_frames, align_frames_sim,
 };
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, SimWithCovariance};
 use nalgebra::SVector;
@@ -73,6 +73,8 @@ pub struct Tally {
     pub inconsistent: u32,
     /// Merged with a false alignment among those used.
     pub with_false: u32,
+    /// Merged or shown right where only the true alignments are given: what no choice among them can surpass by much.
+    pub told_right: u32,
     distance_squared: f64,
     inside: u32,
 }
@@ -123,6 +125,8 @@ pub fn measure(cell: &Cell, seeds: Range<u64>, mut done: impl FnMut()) -> Tally 
                 let outcome = align_frames(&world.alpha, &world.beta, &world.alignments, &config);
                 let judge = |t: &PoseWithCovariance| (world.is_right(&t.pose), t.pose.local(&world.t_alpha_beta));
                 tally.add(&world, outcome, |t| &t.covariance, judge);
+                let told = align_frames(&world.alpha, &world.beta, &true_ones(&world, &world.alignments), &config);
+                tally.add_told(&told, |t| world.is_right(&t.pose));
             }
             Unit::Measured => tally.add_sim(&world, &world.with_unknown_scale(seed), &config),
             Unit::Unmeasured => tally.add_sim(&world, &world.with_unmeasured_scale(seed), &config),
@@ -130,6 +134,10 @@ pub fn measure(cell: &Cell, seeds: Range<u64>, mut done: impl FnMut()) -> Tally 
         done();
     }
     tally
+}
+
+fn true_ones<T: Copy>(world: &World, alignments: &[PairAlignment<T>]) -> Vec<PairAlignment<T>> {
+    alignments.iter().zip(&world.real).filter(|(_, real)| **real).map(|(alignment, _)| *alignment).collect()
 }
 
 impl Tally {
@@ -142,6 +150,14 @@ impl Tally {
         let outcome = align_frames_sim(&sim.alpha, &sim.beta, &sim.alignments, config);
         let judge = |t: &SimWithCovariance| (sim.is_right(&t.sim), t.sim.local(&sim.t_alpha_beta));
         self.add(world, outcome, |t| &t.covariance, judge);
+        let told = align_frames_sim(&sim.alpha, &sim.beta, &true_ones(world, &sim.alignments), config);
+        self.add_told(&told, |t| sim.is_right(&t.sim));
+    }
+
+    fn add_told<T>(&mut self, outcome: &FrameOutcome<T>, is_right: impl Fn(&T) -> bool) {
+        if let FrameOutcome::Merged(c) | FrameOutcome::Provisional(c) = outcome {
+            self.told_right += u32::from(is_right(&c.t_alpha_beta));
+        }
     }
 
     fn add<const N: usize, T>(
@@ -219,11 +235,12 @@ impl Cell {
 /// The table.
 pub fn table(cells: &[Cell], measured: &[Tally]) -> String {
     let mut text = format!(
-        "{:<32} {:>3} {:>12} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6}\n",
+        "{:<32} {:>3} {:>12} {:>6} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6}\n",
         "%",
         "f",
         "goal",
         "right",
+        "told",
         "merged",
         "weak",
         "WRONG",
@@ -245,10 +262,11 @@ pub fn table(cells: &[Cell], measured: &[Tally]) -> String {
         let p = |count| format!("{:.1}", tally.percent(count));
         let _ = writeln!(
             text,
-            "{:<32} {:>3} {goal:>12} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6.2} {:>6.1}  {}",
+            "{:<32} {:>3} {goal:>12} {:>6} {:>6} {:>7} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6.2} {:>6.1}  {}",
             cell.name,
             cell.scale_max,
             p(tally.merged_right + tally.shown_right),
+            p(tally.told_right),
             p(tally.merged_right),
             p(tally.merged_weak),
             p(tally.merged_wrong),
@@ -263,6 +281,7 @@ pub fn table(cells: &[Cell], measured: &[Tally]) -> String {
         );
     }
     text + "\nright: within 8° and 3 m, merged or (with fewer alignments than a merge needs) shown as provisional\n\
+            told:  right where only the true alignments are given\n\
             weak:  merged further off, on true alignments alone; WRONG: merged further off, and not on those alone\n\
             false: merged with a false alignment among those used; shown: provisional and further off\n\
             short: refused, baseline too short for the scale\n"

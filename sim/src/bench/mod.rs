@@ -2,6 +2,7 @@
 
 pub mod corr;
 pub mod cpu;
+pub mod flood;
 pub mod frames;
 pub mod gossip;
 pub mod graph;
@@ -36,6 +37,11 @@ pub enum Bench {
     /// Exit code 1 if a graph did not converge, was not certified, or missed its known optimum; 2 if a file cannot be
     /// used.
     Graph(graph::GraphBench),
+    /// A flood of unknown ids: how much slower honest robots converge, and how much memory it takes
+    ///
+    /// The same swarm of real agents runs without and with 10,000 messages of strangers a second at two of its robots,
+    /// for 60 s; its halves heal meanwhile. Exit code 1 if it is more than twice as slow, or grows by 16 MB.
+    Flood(flood::Flood),
     /// Frame-level consensus on seeded worlds: success, refusals and honesty of the covariance
     ///
     /// Two robots drive a figure-eight of about 120 m with drifting odometry; a cell has 20 alignments between them, of
@@ -59,6 +65,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Registration(options) => registration::run(&options),
         Bench::Gossip(options) => gossip::run(&options),
         Bench::Graph(options) => graph::run(&options),
+        Bench::Flood(options) => flood::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }
 }

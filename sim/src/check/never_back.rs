@@ -1,6 +1,6 @@
 //! What a robot holds never shrinks (DESIGN §8.3, §8.4, and no acknowledged fact is lost): a log that was durable on a
 //! robot's disk up to some place is so at every later moment and after every restart, a log in quarantine stays there,
-//! and the robot's own epoch does not fall. A disk that was wiped, or that lost what it had confirmed, is excused.
+//! and the robot's own epoch does not fall, nor does it return to one that its disk knows as closed. A disk that was wiped, or that lost what it had confirmed, is excused.
 
 use super::{Check, RobotSample, Sample, Seen};
 use merganser_protocol::agent::io::{Output, Record};
@@ -17,8 +17,12 @@ pub struct NeverBack {
 struct Held {
     logs: BTreeMap<FrameId, Log>,
     epoch: u32,
+    /// The first epoch that the disk does not know as closed.
+    open: u32,
     /// Entries handed to the disk, by batch.
     waiting: Vec<(u64, EntryId)>,
+    /// Epochs closed, handed to the disk likewise.
+    closing: Vec<(u64, u32)>,
     /// The last batch handed to the disk, and the last that is on it.
     batches: [u64; 2],
     /// Logs seen in quarantine, by the batch that was then the last: once it is on disk, so must be the proof.
@@ -49,7 +53,8 @@ impl Held {
     fn forget(&mut self) {
         self.logs.clear();
         self.quarantined.clear();
-        self.epoch = 0;
+        self.closing.clear();
+        (self.epoch, self.open) = (0, 0);
     }
 
     fn compare(&mut self, robot: &RobotSample) -> Result<(), String> {
@@ -100,16 +105,24 @@ impl Check for NeverBack {
                     Record::Entry { id, .. } => Some((*batch, *id)),
                     _ => None,
                 }));
+                held.closing.extend(records.iter().filter_map(|record| match record {
+                    Record::EpochClosed { epoch } => Some((*batch, *epoch)),
+                    _ => None,
+                }));
             }
             Seen::Durable(batch) => {
                 let (durable, later): (Vec<_>, Vec<_>) = held.waiting.iter().partition(|(number, _)| number <= batch);
                 held.waiting = later;
                 held.batches[1] = *batch;
                 durable.into_iter().for_each(|(_, id)| held.logs.entry(id.frame).or_default().add(id.seq));
+                let closed = held.closing.iter().filter(|(number, _)| number <= batch);
+                held.open = closed.map(|(_, epoch)| epoch.saturating_add(1)).fold(held.open, u32::max);
+                held.closing.retain(|(number, _)| number > batch);
             }
-            // An epoch that was begun and had no entry yet may die with its process.
+            // An epoch that was begun may die with its process, unless the disk knows that the one before was closed.
             Seen::Died => {
-                (held.waiting, held.epoch, held.batches) = (Vec::new(), 0, [0, 0]);
+                (held.waiting, held.epoch, held.batches) = (Vec::new(), held.open, [0, 0]);
+                held.closing.clear();
                 held.quarantined.clear();
             }
             Seen::Wiped | Seen::Damaged => held.forget(),
@@ -187,6 +200,27 @@ mod tests {
             check.sample(&sample(vec![one], &truth, &expect))
         };
         assert!(at(5).is_ok() && at(6).is_ok() && at(5).is_err());
+    }
+
+    #[test]
+    fn it_bites_on_a_closed_epoch_that_is_taken_up_again_after_a_restart() {
+        for durable in [false, true] {
+            let (truth, expect) = (BTreeMap::new(), Expect::default());
+            let mut check = NeverBack::default();
+            let output = Output::Persist { batch: 1, records: vec![Record::EpochClosed { epoch: 5 }] };
+            check.see(0, &Seen::Output(&output)).unwrap();
+            if durable {
+                check.see(0, &Seen::Durable(1)).unwrap();
+            }
+            check.see(0, &Seen::Died).unwrap();
+            let mut at = |epoch| {
+                let mut one = robot("alpha", 1, &[]);
+                one.snapshot.as_mut().unwrap().status.epoch = epoch;
+                check.sample(&sample(vec![one], &truth, &expect))
+            };
+            assert_eq!(at(5).is_err(), durable);
+            assert!(at(6).is_ok());
+        }
     }
 
     #[test]

@@ -301,7 +301,7 @@ impl<C: Core> Swarm<C> {
             let input = super::hostile::from_nobody(&mut dice);
             self.feed(now, robot, input);
         }
-        if now < secs(at + lasts) && !self.healed {
+        if now < secs(at + lasts) {
             self.queue.push(now.after(millis(1e3 * TICK_SECS)), Event::Flood(index));
         }
     }

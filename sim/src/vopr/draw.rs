@@ -130,6 +130,8 @@ fn faults(scenario: &Scenario, seed: u64, solve: bool) -> Vec<Fault> {
         drawn.doubtful_disks();
         drawn.members();
     }
+    drawn.dice = Dice::new(seed, "vopr new frames");
+    drawn.new_frames();
     drawn.faults.sort_by(|a, b| a.begins().total_cmp(&b.begins()));
     drawn.faults
 }
@@ -232,6 +234,16 @@ impl Faults<'_> {
         if self.happens(0.15) && self.names.len() > 2 {
             let ((at, _), robot) = (self.when(0.0, 0.0), self.robot());
             self.faults.push(Fault::Leave { at, robot });
+        }
+    }
+
+    /// The SLAM restarts, and before the new frame has its first fact, so does the robot.
+    fn new_frames(&mut self) {
+        if self.happens(0.15) {
+            let ((at, _), robot) = (self.when(8.0, 8.0), self.robot());
+            let (later, lasts) = (self.dice.range(0.1, 3.0), self.dice.range(0.1, 5.0));
+            self.faults.push(Fault::NewFrame { at, robot: robot.clone() });
+            self.faults.push(Fault::Kill { at: at + later, lasts, robot });
         }
     }
 

@@ -2,6 +2,7 @@
 
 use super::FrameOutcome;
 use super::clique::{self, Set, bit};
+use super::doubt::Doubt;
 use super::evidence::Evidence;
 use super::explain::Explanation;
 use super::gate;
@@ -15,6 +16,9 @@ use crate::geometry::Covariance;
 const RIVAL_SHARE: f64 = 0.8;
 /// One more gate, for candidates only: so much beyond the widest that a truth which chance stretched is still found whole.
 const REACH: f64 = 1.3;
+/// Doubtful members leave the answer open if the other frame's map is to be expected off, should they be false, by more
+/// than this share of an alignment's reach.
+const RISK_MAX: f64 = 0.15;
 /// Too few or too weak to merge are shown below this: chance does as well in one case of ten.
 const SHOWN_LOG10_NFA_MAX: f64 = -1.0;
 
@@ -32,6 +36,7 @@ impl<const N: usize, G: Scaled<N>> Measured<'_, N, G> {
         let Some(best) = Hypothesis::settle(self, &pairs, explanation.used(&mut evidence)) else {
             return FrameOutcome::Inconsistent;
         };
+        let (best, certain) = self.beyond_doubt(&pairs, &mut evidence, best);
         if let Some(rival) = self.rival(&pairs, &explanation) {
             return FrameOutcome::Ambiguous { best: best.consensus(self), rival: rival.consensus(self) };
         }
@@ -41,12 +46,35 @@ impl<const N: usize, G: Scaled<N>> Measured<'_, N, G> {
         let shown = best.log10_nfa <= SHOWN_LOG10_NFA_MAX || 2 * used > n;
         match best.lacks_scale(self) {
             Some(log_scale_sigma) if significant || shown => FrameOutcome::BaselineTooShort { log_scale_sigma },
-            None if used >= self.config.alignments_min && (significant || n == 1) => {
+            None if certain && used >= self.config.alignments_min && (significant || n == 1) => {
                 FrameOutcome::Merged(best.consensus(self))
             }
             None if shown => FrameOutcome::Provisional(best.consensus(self)),
             _ => FrameOutcome::Inconsistent,
         }
+    }
+
+    /// `best` without its doubtful members, and that it is certain; or with them, and that it is not, where too few would be
+    /// left or too much hangs on them. Its covariance reckons with the doubt that remains.
+    fn beyond_doubt(
+        &self,
+        pairs: &Pairs,
+        evidence: &mut Evidence<'_, N, G>,
+        mut best: Hypothesis<N, G>,
+    ) -> (Hypothesis<N, G>, bool) {
+        let mut doubt = Doubt::of(self, pairs, evidence, &best);
+        let needed = self.config.alignments_min.min(best.set.count_ones() as usize);
+        let safe = doubt.risk <= RISK_MAX * self.config.search_edge_min;
+        let certain = safe && doubt.certain.count_ones() as usize >= needed;
+        if certain
+            && doubt.certain != best.set
+            && let Some(without) = Hypothesis::settle(self, pairs, doubt.certain)
+        {
+            best = without;
+            doubt = Doubt::of(self, pairs, evidence, &best);
+        }
+        best.widen(&doubt.covariance);
+        (best, certain)
     }
 
     /// Sets that may speak of one transform: at each gate a largest clique, and a largest with each alignment, settled.

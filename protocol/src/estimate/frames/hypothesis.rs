@@ -8,9 +8,11 @@ use super::pairs::Pairs;
 use super::predict::surprise;
 use super::scaled::{LOG_SCALE_SIGMA_MAX, Scaled, log_scale_sigma};
 use crate::geometry::Covariance;
+use nalgebra::SMatrix;
 
 /// A member this improbable, given what the others predict, is none.
 const SURPRISE_MIN: f64 = 1e-3;
+
 /// A settled set of alignments.
 pub(super) struct Hypothesis<const N: usize, G> {
     pub(super) set: Set,
@@ -36,6 +38,20 @@ impl<const N: usize, G: Scaled<N>> Hypothesis<N, G> {
         let unmeasured = clique::vertices(self.set).all(|l| !measured.alignments[l].measures_scale);
         let sigma = log_scale_sigma(&self.gls.covariance);
         (unmeasured && sigma > LOG_SCALE_SIGMA_MAX).then_some(sigma)
+    }
+
+    pub(super) fn t_alpha_beta(&self) -> &G {
+        &self.gls.t_alpha_beta
+    }
+
+    /// Of the local perturbation, before any scale.
+    pub(super) fn covariance(&self) -> &SMatrix<f64, N, N> {
+        &self.gls.covariance
+    }
+
+    /// Adds to the covariance.
+    pub(super) fn widen(&mut self, by: &SMatrix<f64, N, N>) {
+        self.gls.covariance += by;
     }
 
     /// As an answer to the caller.

@@ -108,6 +108,46 @@ fn blends_of_truth_and_lie_never_merge() {
 }
 
 #[test]
+fn no_merge_hangs_on_a_near_miss() {
+    // Worlds that merged wrongly before doubtful members were told: a near miss far from where the true ones crowd.
+    let under_reported = Draw { under_reported: 3.0, ..draw(4, 0, 16) };
+    for (d, seeds) in [
+        (draw(2, 0, 18), &[200_506, 403_465, 404_673, 404_825, 412_902][..]),
+        (draw(3, 0, 17), &[404_673, 416_720]),
+        (draw(4, 0, 16), &[412_085, 414_004]),
+        (under_reported, &[200_275, 200_328, 200_661, 200_983, 402_532]),
+    ] {
+        for &seed in seeds {
+            let w = World::new(seed, d);
+            if let FrameOutcome::Merged(c) = align_frames(&w.alpha, &w.beta, &w.alignments, &config(3.0)) {
+                let on_true_alone = c.used.iter().all(|&k| w.real[k]);
+                assert!(on_true_alone || w.is_right(&c.t_alpha_beta.pose), "seed {seed}: {c:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_doubtful_member_leaves_the_others_to_merge_alone() {
+    // Ten that hold each other, and one that may as well be a near miss: dropped, and nothing moves.
+    let (mut dropped, mut kept) = (0, 0);
+    for seed in 0..20 {
+        let mut w = World::new(62_000 + seed, draw(10, 0, 10));
+        let FrameOutcome::Merged(before) = align_frames(&w.alpha, &w.beta, &w.alignments, &config(3.0)) else {
+            panic!("seed {seed}")
+        };
+        let far = w.real.iter().position(|&r| r).unwrap();
+        let push = Se3::exp(&nalgebra::Vector6::new(0.35, -0.3, 0.25, 0.03, -0.05, 0.05));
+        w.alignments[far].t_i_j.pose = w.alignments[far].t_i_j.pose * push;
+        let after = align_frames(&w.alpha, &w.beta, &w.alignments, &config(3.0));
+        let FrameOutcome::Merged(after) = after else { panic!("seed {seed}: {after:?}") };
+        assert!(w.is_right(&after.t_alpha_beta.pose) && w.is_right(&before.t_alpha_beta.pose), "seed {seed}");
+        *(if after.used.contains(&far) { &mut kept } else { &mut dropped }) += 1;
+    }
+    assert!(dropped >= 15, "{dropped} dropped, {kept} kept");
+}
+
+#[test]
 fn two_alignments_are_shown_and_three_are_used() {
     let w = World::new(1, draw(3, 0, 0));
     let outcome = |n: usize, config: &FrameConsensusConfig| align_frames(&w.alpha, &w.beta, &w.alignments[..n], config);

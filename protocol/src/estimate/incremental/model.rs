@@ -183,7 +183,7 @@ impl Model {
 
     /// What [`Model::defect`] cannot much exceed, at a tenth of its cost: the terms of second order, each as large as it
     /// can be. `None` where scales moved.
-    fn defect_bound(&self, tree: &CliqueTree, edge: &Edge) -> Option<f64> {
+    pub(super) fn defect_bound(&self, tree: &CliqueTree, edge: &Edge) -> Option<f64> {
         let ((rho_i, phi_i, scale_i), (rho_j, phi_j, scale_j)) = (self.delta(tree, edge.i), self.delta(tree, edge.j));
         if scale_i != 0.0 || scale_j != 0.0 {
             return None;
@@ -194,7 +194,7 @@ impl Model {
     }
 
     /// By how many standard deviations the linear residual is off.
-    fn defect(&self, tree: &CliqueTree, edge: &Edge) -> f64 {
+    pub(super) fn defect(&self, tree: &CliqueTree, edge: &Edge) -> f64 {
         let at = edge.linearise(&self.points);
         let tangent = |node: usize| {
             let (rho, phi, lambda) = self.delta(tree, node);

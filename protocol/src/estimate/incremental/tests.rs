@@ -293,3 +293,98 @@ fn covariances_are_those_of_a_batch_solve() {
         assert_eq!(itself.sim().to_se3(), Se3::identity());
     }
 }
+
+/// Two anchors and one factor, solved; then a much surer factor says that the second is turned and moved by `delta`.
+fn pushed(delta: [f64; 6]) -> (Incremental, Update) {
+    let (i, j) = (submap(0, 0), submap(0, 1));
+    let factor = |pose: Se3, sigma: f64| {
+        let t_i_j = Relative::Metric(PoseWithCovariance { pose, covariance: sigmas(sigma, sigma) });
+        Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 }
+    };
+    let nodes = BTreeSet::from([i, j]);
+    let graph = Graph::components(&nodes, &BTreeSet::new(), vec![factor(Se3::identity(), 0.1)]).unwrap().remove(0);
+    let solution = solve(graph, vec![Sim3::identity(); 2], 10).unwrap();
+    let mut grown = Incremental::new(solution, &BTreeSet::new()).unwrap();
+    let factors = vec![factor(Se3::exp(&delta.into()), 1e-4)];
+    let update = grown.add(Addition { factors, ..Addition::default() }).unwrap();
+    (grown, update)
+}
+
+#[test]
+fn an_anchor_is_linearised_anew_once_it_has_turned_enough_or_the_linear_model_is_off() {
+    // Pure turns about one axis are linear in the residual: only the turn itself counts.
+    for (turn, anew) in [(0.99 * model::ROTATION_MAX, false), (1.01 * model::ROTATION_MAX, true)] {
+        let (_, update) = pushed([0.0, 0.0, 0.0, 0.0, 0.0, turn]);
+        assert_eq!(update.relinearised > 0, anew, "{turn}");
+    }
+    // Pure shifts are linear.
+    let (_, update) = pushed([50.0, -20.0, 10.0, 0.0, 0.0, 0.0]);
+    assert_eq!(update.relinearised, 0);
+    // A turn with a shift bends the residual by about half their product, here in units of 1e-4.
+    for (shift, anew) in [(1e-4, false), (4e-3, true)] {
+        let (_, update) = pushed([shift, 0.0, 0.0, 0.0, 0.0, 0.005]);
+        assert_eq!(update.relinearised > 0, anew, "{shift}");
+    }
+}
+
+#[test]
+fn the_bound_on_defects_holds() {
+    let mut largest: f64 = 0.0;
+    for seed in 0..4 {
+        let mut growth = Growth::new(seed, 3, false);
+        let mut grown = started(&mut growth, 4);
+        for step in 0..60 {
+            grown.add(growth.drive(step % 3, 1, 0.3)).unwrap();
+            for edge in &grown.model.edges {
+                let defect = grown.model.defect(&grown.tree, edge);
+                let bound = grown.model.defect_bound(&grown.tree, edge).unwrap();
+                assert!(defect <= bound + 1e-9, "{defect} {bound}");
+                assert!(defect <= model::DEFECT_MAX);
+                largest = largest.max(defect);
+            }
+        }
+    }
+    assert!(largest > 0.1 * model::DEFECT_MAX, "{largest}: nothing was tested");
+}
+
+#[test]
+fn a_factor_that_fills_up_is_ordered_afresh() {
+    let mut growth = Growth::new(6, 1, false);
+    growth.drive(0, 40, 0.0);
+    let mut grown = Incremental::new(growth.batch(&growth.truth), &growth.unknown).unwrap();
+    let (mut reordered, mut loops) = (0, 0);
+    // A chain that becomes a thicket: the factor must grow.
+    for i in (0..40).step_by(3) {
+        for j in (i + 2..40).step_by(5) {
+            let factor = growth.measure(submap(0, i), submap(0, j));
+            growth.factors.push(factor);
+            let update = grown.add(Addition { factors: vec![factor], ..Addition::default() }).unwrap();
+            (reordered, loops) = (reordered + usize::from(update.reordered), loops + 1);
+            assert!(grown.fill_now() <= FILL_GROWTH_MAX * grown.fill, "loop {loops}");
+        }
+    }
+    assert!((1..loops / 4).contains(&reordered), "{reordered} of {loops}");
+    assert!(growth.apart(&grown) < APART_MAX);
+}
+
+#[test]
+fn far_from_the_minimum_settling_gives_up_and_leaves_all_as_it_was() {
+    let mut growth = Growth::new(9, 2, false);
+    growth.drive(0, 12, 0.5);
+    growth.drive(1, 12, 0.8);
+    let graph = Graph::components(&growth.nodes, &growth.unknown, growth.factors.clone()).unwrap().remove(0);
+    let mut refused = 0;
+    for seed in 0..10 {
+        let rng = &mut rng(seed);
+        let start = growth.nodes.iter().map(|_| Sim3::from_se3(&any_pose(rng, 20.0))).collect();
+        let mut grown = Incremental::new(solve(graph.clone(), start, 0).unwrap(), &growth.unknown).unwrap();
+        let old = bits(&grown);
+        match grown.settle() {
+            Ok(_) => continue,
+            Err(error) => assert_eq!(error, IncrementalError::Diverged),
+        }
+        refused += 1;
+        assert_eq!(bits(&grown), old);
+    }
+    assert!(refused > 0);
+}

@@ -3,9 +3,8 @@
 //! Columns, by name: `robot_src, pose_src, robot_dst, pose_dst, qx, qy, qz, qw, tx, ty, tz, kappa, tau`, and optionally
 //! `is_known_inlier, weight`. A pose becomes the g2o id with the robot's letter in the top byte, as GTSAM's symbols are.
 
-use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, printed_matrix};
+use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_information, printed_matrix};
 use crate::geometry::Se3;
-use nalgebra::Matrix6;
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 
@@ -142,7 +141,7 @@ impl Importer {
             known: row.get("is_known_inlier").is_some_and(|&text| text == "1"),
             weight: if row.contains_key("weight") { number("weight")? } else { 1.0 },
         };
-        let (printed, information, line) = (printed_matrix(xyzw), isotropic(kappa, tau), self.line);
+        let (printed, information, line) = (printed_matrix(xyzw), isotropic_information(kappa, tau), self.line);
         self.add(Measurement { i, j, t_i_j, printed, information, kappa, tau, line }, recorded)
     }
 
@@ -165,14 +164,6 @@ impl Importer {
         self.recorded.push(recorded);
         Ok(())
     }
-}
-
-/// The information of isotropic weights.
-fn isotropic(kappa: f64, tau: f64) -> Matrix6<f64> {
-    let mut out = Matrix6::zeros();
-    out.view_mut((0, 0), (3, 3)).fill_diagonal(tau);
-    out.view_mut((3, 3), (3, 3)).fill_diagonal(2.0 * kappa);
-    out
 }
 
 /// The id of a robot's pose: its letter in the top byte.

@@ -33,7 +33,8 @@ pub struct Measurement {
     pub t_i_j: Se3,
     /// Its rotation as printed, which rounding may have made only nearly one (see [`ChordalEdge::r_i_j`]).
     pub printed: Matrix3<f64>,
-    /// Information of its local perturbation (ρ, φ); symmetric positive definite.
+    /// Information of its local perturbation (ρ, φ): symmetric, its translation and rotation blocks invertible. That
+    /// all of it is positive definite is asked only by those who minimise χ².
     pub information: Matrix6<f64>,
     /// SE-Sync's weight of the rotation.
     pub kappa: f64,
@@ -87,13 +88,22 @@ impl PoseGraph {
         ChordalGraph { nodes: self.poses.len(), edges: self.measurements.iter().map(edge).collect() }
     }
 
+    /// The graph with the isotropic weights in place of the information.
+    pub fn isotropic(mut self) -> Self {
+        self.measurements.iter_mut().for_each(|m| m.information = isotropic_information(m.kappa, m.tau));
+        self
+    }
+
+    /// Whether every measurement's information is positive definite.
+    pub fn has_covariances(&self) -> bool {
+        self.measurements.iter().all(|m| covariance_of(&m.information).is_some())
+    }
+
     /// Whether every measurement's information is that of its isotropic weights, so that the certificate of the
     /// chordal cost speaks of the graph itself.
     pub fn is_isotropic(&self) -> bool {
         let is_isotropic = |m: &Measurement| {
-            let mut want = Matrix6::zeros();
-            want.view_mut((0, 0), (3, 3)).fill_diagonal(m.tau);
-            want.view_mut((3, 3), (3, 3)).fill_diagonal(2.0 * m.kappa);
+            let want = isotropic_information(m.kappa, m.tau);
             (m.information - want).amax() <= 1e-6 * want.amax()
         };
         !self.planar && self.measurements.iter().all(is_isotropic)
@@ -107,6 +117,14 @@ pub fn isotropic_weights(information: &Matrix6<f64>) -> Option<(f64, f64)> {
     let of_rotation = information.fixed_view::<3, 3>(3, 3).into_owned().try_inverse()?.trace();
     let (kappa, tau) = (1.5 / of_rotation, 3.0 / of_translation);
     (kappa.is_finite() && tau.is_finite() && kappa > 0.0 && tau > 0.0).then_some((kappa, tau))
+}
+
+/// The information of isotropic weights.
+fn isotropic_information(kappa: f64, tau: f64) -> Matrix6<f64> {
+    let mut out = Matrix6::zeros();
+    out.view_mut((0, 0), (3, 3)).fill_diagonal(tau);
+    out.view_mut((3, 3), (3, 3)).fill_diagonal(2.0 * kappa);
+    out
 }
 
 /// The matrix of a quaternion (x, y, z, w) by the formula for unit ones, whatever its norm.

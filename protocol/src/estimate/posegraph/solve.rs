@@ -32,6 +32,11 @@ pub enum PoseGraphError {
     /// The start wants a value that the file does not give.
     #[error("pose {0} has no value; add its vertex or start from the relaxation")]
     NoValue(u64),
+    /// A measurement's information that is no inverse of a covariance.
+    #[error(
+        "line {0}: the information matrix is not positive definite; mend it, or solve with isotropic weights in its place"
+    )]
+    Information(usize),
     /// Poses that no measurement ties together.
     #[error("the graph has {0} parts; solve each by itself")]
     Parts(usize),
@@ -129,12 +134,11 @@ impl PoseGraph {
     fn graph(&self) -> Result<Graph, PoseGraphError> {
         let place: BTreeMap<u64, SubmapId> = self.poses.keys().copied().zip((0..).map(node)).collect();
         let factor = |m: &super::Measurement| {
-            // An information that is not positive definite does not pass the parsers.
-            let covariance = covariance_of(&m.information).unwrap_or_else(|| Covariance::new_or_wider(m.information));
+            let covariance = covariance_of(&m.information).ok_or(PoseGraphError::Information(m.line))?;
             let t_i_j = Relative::Metric(PoseWithCovariance { pose: m.t_i_j, covariance });
-            Factor { label: Label::Odometry, i: place[&m.i], j: place[&m.j], t_i_j, weight: 1.0 }
+            Ok(Factor { label: Label::Odometry, i: place[&m.i], j: place[&m.j], t_i_j, weight: 1.0 })
         };
-        let factors = self.measurements.iter().map(factor).collect();
+        let factors = self.measurements.iter().map(factor).collect::<Result<_, PoseGraphError>>()?;
         let nodes: BTreeSet<SubmapId> = place.values().copied().collect();
         let mut graphs = Graph::components(&nodes, &BTreeSet::new(), factors)?;
         match (graphs.pop(), graphs.len()) {

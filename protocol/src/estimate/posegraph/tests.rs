@@ -23,9 +23,7 @@ fn ring(seed: u64, n: u64, noise: (f64, f64)) -> (Vec<Se3>, PoseGraph) {
         let error = se3::join(&(normal(rng) * noise.0), &(normal(rng) * noise.1));
         let t_i_j = (truth[i as usize].inverse() * truth[j as usize]).retract(&error);
         let (kappa, tau) = (0.5 / noise.1.powi(2), noise.0.powi(-2));
-        let mut information = Matrix6::zeros();
-        information.view_mut((0, 0), (3, 3)).fill_diagonal(tau);
-        information.view_mut((3, 3), (3, 3)).fill_diagonal(2.0 * kappa);
+        let information = isotropic_information(kappa, tau);
         let printed = t_i_j.rotation.matrix();
         graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
     }
@@ -232,7 +230,10 @@ fn faults_name_their_line_and_what_to_do() {
     assert_eq!(fault("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 2"), Fault::Quaternion(2.0));
     assert_eq!(fault(&good.replacen("0 1 1", "1 1 1", 1)), Fault::SelfLoop(1));
     assert_eq!(fault(&good.replace("0 1 0 1", "0 0 0 1")), Fault::Information);
-    assert_eq!(fault(&good.replace("0 1 0 1", "0 -1 0 1")), Fault::Information);
+    let indefinite = parsed(&good.replace("0 0 0 0 0 1 0 0 0 0", "0 0 0 0 9 1 0 0 0 0")).unwrap();
+    let start = indefinite.start(Start::Relaxed, 10).unwrap();
+    assert_eq!(indefinite.solve(&start, 10).unwrap_err(), PoseGraphError::Information(1));
+    assert!(indefinite.isotropic().solve(&start, 10).is_ok());
     assert_eq!(fault(&"x".repeat(LINE_MAX + 1)), Fault::Long);
     assert_eq!(fault(&format!("#{}", "x".repeat(LINE_MAX))), Fault::Long);
     let two = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 0 1 0 0";

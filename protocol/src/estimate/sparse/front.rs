@@ -3,6 +3,8 @@
 use super::dense::{Panel, Scratch};
 use super::{BlockPattern, Front, Piece};
 use crate::estimate::solve::SolveError;
+use std::collections::BTreeSet;
+use std::ops::Range;
 
 /// A Cholesky factor `H = L Lᵀ`, its panels laid out as [`BlockPattern`] says.
 #[derive(Clone, Debug, Default)]
@@ -74,6 +76,32 @@ impl BlockPattern {
                 front.backward(&factor.values, x, &mut gathered);
             }
         }
+    }
+}
+
+impl BlockPattern {
+    /// Replaces each of the right-hand sides that follow one another in `b`, zero but at `scalars`, by `L⁻¹ b`: only the
+    /// fronts from those scalars up to the root are touched. Returns the scalars that may not be zero now.
+    pub(in crate::estimate) fn solve_upwards(
+        &self,
+        factor: &Factor,
+        scalars: impl IntoIterator<Item = usize>,
+        b: &mut [f64],
+    ) -> Vec<Range<usize>> {
+        let mut path = BTreeSet::new();
+        for scalar in scalars {
+            let mut at = Some(self.fronts.partition_point(|f| f.pivots.end <= scalar));
+            while let Some(front) = at.filter(|&front| front < self.fronts.len() && path.insert(front)) {
+                at = self.fronts[front].parent;
+            }
+        }
+        let mut gathered = Vec::new();
+        for front in path.iter().map(|&k| &self.fronts[k]) {
+            for x in b.chunks_exact_mut(self.scalars()) {
+                front.forward(&factor.values, x, &mut gathered);
+            }
+        }
+        path.iter().map(|&k| self.fronts[k].pivots.clone()).collect()
     }
 }
 

@@ -3,6 +3,9 @@
 use crate::dice::Dice;
 use clap::ValueEnum;
 
+/// How often places and contacts are looked at, s.
+pub const TICK: f64 = 0.5;
+
 /// What happens to the swarm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Case {
@@ -179,7 +182,8 @@ impl Field {
             Layout::Ferry { .. } => 20.0,
         };
         let half = |p: [f64; 2]| p[0] < self.side as f64 / 2.0;
-        (p[0] - q[0]).hypot(p[1] - q[1]) < range && !(cut && half(p) != half(q))
+        let (dx, dy) = (p[0] - q[0], p[1] - q[1]);
+        dx * dx + dy * dy < range * range && !(cut && half(p) != half(q))
     }
 
     /// Whether links change with time.

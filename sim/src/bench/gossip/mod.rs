@@ -1,8 +1,9 @@
 //! `merganser-sim bench gossip`: what it costs to make the sets of facts of a whole swarm equal (DESIGN §4). Robots hold
 //! real replicas of real signed entries; only the radio, the motion and the time are made up. Beside our gossip runs a
 //! plain one in the same worlds, on the same messages: root hashes at a fixed interval, then the whole have-vector with
-//! hashes to whoever differs.
+//! hashes to whoever differs. Where contacts come and go, the time that no gossip can beat is told as well.
 
+mod bound;
 mod field;
 mod plain;
 mod policy;
@@ -58,6 +59,9 @@ pub fn run(options: &Gossip) -> anyhow::Result<bool> {
         world.robots = options.robots.map_or(world.robots, usize::from);
         world.loss = options.loss.map_or(world.loss, |percent| f64::from(percent) / 100.0);
         for seed in options.first..options.first + options.seeds {
+            if let Some(bound) = bound::bound(&world, seed) {
+                bar.suspend(|| writeln!(out, "{bound}"))?;
+            }
             for policy in policies {
                 let outcome = measure(&world, *policy, seed)?;
                 all &= outcome.converged();

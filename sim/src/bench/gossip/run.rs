@@ -1,6 +1,6 @@
 //! One swarm from the start until all sets are equal.
 
-use super::field::{Field, World};
+use super::field::{Field, TICK, World};
 use super::policy::{Gossip, Policy};
 use super::radio::Radio;
 use crate::dice::Dice;
@@ -23,8 +23,6 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::rc::Rc;
 
-/// How often places and contacts are looked at.
-const TICK: f64 = 0.5;
 /// How long an unanswered question is waited for.
 const ANSWER_SECS: f64 = 2.0;
 /// Time that a steady swarm is given after it became equal, before it is measured.
@@ -36,16 +34,16 @@ const EPOCH: u32 = 200_000_000;
 #[derive(Clone, Debug)]
 pub struct Outcome {
     name: &'static str,
-    policy: Policy,
+    gossip: &'static str,
     seed: u64,
     robots: usize,
     loss: f64,
     /// Seconds from the heal (else from the start) until all sets were equal.
     pub equal_after: Option<f64>,
     /// Bytes per robot that are not entries.
-    pub control: f64,
+    pub control: Option<f64>,
     /// Bytes of entries sent, over bytes that had to arrive.
-    pub data_ratio: f64,
+    pub data_ratio: Option<f64>,
     /// Bytes per robot and second after all was settled.
     pub steady: Option<f64>,
 }
@@ -55,6 +53,12 @@ impl Outcome {
     pub const HEADER: &'static str =
         "case           robots  loss  gossip  seed   equal after s   control kB/robot   data/needed   steady B/s";
 
+    /// When sets could have been equal at best.
+    pub fn of_bound(world: &World, seed: u64, equal_after: Option<f64>) -> Self {
+        let (name, robots, loss) = (world.name, world.robots, world.loss);
+        Self { name, gossip: "bound", seed, robots, loss, equal_after, control: None, data_ratio: None, steady: None }
+    }
+
     /// Whether all sets became equal.
     pub fn converged(&self) -> bool {
         self.equal_after.is_some()
@@ -63,20 +67,19 @@ impl Outcome {
 
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let policy = if self.policy == Policy::Ours { "ours" } else { "plain" };
-        let number = |value: Option<f64>| value.map_or_else(|| "-".into(), |value| format!("{value:.1}"));
+        let digits = |value: Option<f64>, n| value.map_or_else(|| "-".into(), |value| format!("{value:.n$}"));
         write!(
             f,
-            "{:<14} {:>6} {:>4.0}%  {:<6} {:>5} {:>15} {:>18.1} {:>13.3} {:>12}",
+            "{:<14} {:>6} {:>4.0}%  {:<6} {:>5} {:>15} {:>18} {:>13} {:>12}",
             self.name,
             self.robots,
             100.0 * self.loss,
-            policy,
+            self.gossip,
             self.seed,
-            number(self.equal_after),
-            self.control / 1e3,
-            self.data_ratio,
-            number(self.steady),
+            digits(self.equal_after, 1),
+            digits(self.control.map(|bytes| bytes / 1e3), 1),
+            digits(self.data_ratio, 3),
+            digits(self.steady, 1),
         )
     }
 }
@@ -393,13 +396,13 @@ impl<'a> Swarm<'a> {
         let robots = world.robots as f64;
         Outcome {
             name: world.name,
-            policy,
+            gossip: if policy == Policy::Ours { "ours" } else { "plain" },
             seed,
             robots: world.robots,
             loss: world.loss,
             equal_after: self.equal_at.map(|at| at.as_secs_f64() - world.heal_at),
-            control: self.control as f64 / robots,
-            data_ratio: self.data as f64 / self.needed.max(1) as f64,
+            control: Some(self.control as f64 / robots),
+            data_ratio: Some(self.data as f64 / self.needed.max(1) as f64),
             steady: self
                 .settled
                 .map(|(at, before)| (self.control - before) as f64 / robots / self.queue.now().since(at).as_secs_f64()),

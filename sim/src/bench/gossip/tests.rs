@@ -1,6 +1,7 @@
 //! The bench itself: a run is a function of its seed, sets do become equal, and a gossip that never asks is found out.
 
-use super::field::Case;
+use super::bound::bound;
+use super::field::{Case, Layout};
 use super::measure;
 use super::policy::Policy;
 
@@ -22,8 +23,8 @@ fn every_case_converges_with_either_gossip_and_moves_at_least_what_is_needed() {
         for policy in [Policy::Ours, Policy::Plain] {
             let outcome = measure(&small(case), policy, 1).unwrap();
             assert!(outcome.converged(), "{outcome}");
-            assert!(outcome.data_ratio >= 1.0, "{outcome}");
-            assert!(outcome.control > 0.0, "{outcome}");
+            assert!(outcome.data_ratio.is_some_and(|ratio| ratio >= 1.0), "{outcome}");
+            assert!(outcome.control.is_some_and(|bytes| bytes > 0.0), "{outcome}");
         }
     }
 }
@@ -39,4 +40,18 @@ fn a_quiet_swarm_is_measured_after_it_settled() {
     let world = super::field::World { until: 200.0, ..small(Case::Steady) };
     let outcome = measure(&world, Policy::Ours, 1).unwrap();
     assert!(outcome.steady.is_some_and(|rate| rate > 0.0 && rate < 50.0), "{outcome}");
+}
+
+#[test]
+fn nothing_beats_the_bound_and_ours_comes_near_it() {
+    assert!(bound(&small(Case::Split), 1).is_none(), "nobody moves");
+    for case in [Case::Ferry, Case::Mobile] {
+        let mut world = small(case);
+        if let Layout::Waypoints { side_m, .. } = &mut world.layout {
+            *side_m = 250.0;
+        }
+        let least = bound(&world, 1).and_then(|outcome| outcome.equal_after).unwrap();
+        let ours = measure(&world, Policy::Ours, 1).unwrap().equal_after.unwrap();
+        assert!(least > 0.0 && least <= ours + 0.5 && ours < 1.25 * least + 10.0, "{least} {ours}");
+    }
 }

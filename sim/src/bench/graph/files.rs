@@ -13,21 +13,68 @@ pub(super) struct Source {
     /// Its name in optima.csv.
     pub(super) name: String,
     pub(super) files: Vec<PathBuf>,
+    /// The whole graph in one file, where there is one; its poses may not tell their robots.
+    full: Option<PathBuf>,
+    /// Kollagen keeps closures between robots in a file of their own, and numbers each robot's poses from 0.
+    closures: Option<PathBuf>,
 }
 
 impl Source {
-    /// Reads it.
+    /// The one file that holds it all, if there is one.
+    pub(super) fn one_file(&self) -> Option<&Path> {
+        let only = || self.files.first().filter(|_| self.files.len() == 1);
+        self.full.as_ref().or_else(only).map(PathBuf::as_path)
+    }
+
+    /// Reads it, from one file where there is one.
     pub(super) fn read(&self) -> anyhow::Result<PoseGraph> {
+        let Some(path) = self.one_file() else { return self.read_robots() };
         let mut parser = Parser::default();
-        for path in &self.files {
-            let place = || path.display().to_string();
-            parser.begin();
-            for line in BufReader::new(File::open(path).with_context(place)?).lines() {
-                parser.line(&line.with_context(place)?).with_context(place)?;
-            }
+        read_into(&mut parser, path, |line| line)?;
+        Ok(parser.finish())
+    }
+
+    /// Reads all robots' files.
+    pub(super) fn read_robots(&self) -> anyhow::Result<PoseGraph> {
+        let mut parser = Parser::default();
+        for (robot, path) in (0..).zip(&self.files) {
+            let own = |line: String| if self.closures.is_some() { lettered(&line, robot) } else { line };
+            read_into(&mut parser, path, own)?;
+        }
+        if let Some(path) = &self.closures {
+            read_into(&mut parser, path, |line| closure(&line))?;
         }
         Ok(parser.finish())
     }
+}
+
+fn read_into(parser: &mut Parser, path: &Path, mend: impl Fn(String) -> String) -> anyhow::Result<()> {
+    let place = || path.display().to_string();
+    parser.begin();
+    for line in BufReader::new(File::open(path).with_context(place)?).lines() {
+        parser.line(&mend(line.with_context(place)?)).with_context(place)?;
+    }
+    Ok(())
+}
+
+/// The id of a robot's pose as GTSAM's symbols have it; what is no number stays, for the parser to refuse.
+fn symbol(robot: u64, pose: &str) -> String {
+    pose.parse::<u64>().map_or_else(|_| pose.to_owned(), |k| (((u64::from(b'a') + robot) << 56) | k).to_string())
+}
+
+/// A g2o line whose ids are given the robot's letter.
+fn lettered(line: &str, robot: u64) -> String {
+    let ids = if line.starts_with("EDGE") { 2 } else { 1 };
+    let word = |(k, word): (usize, &str)| if (1..=ids).contains(&k) { symbol(robot, word) } else { word.to_owned() };
+    line.split_whitespace().enumerate().map(word).collect::<Vec<_>>().join(" ")
+}
+
+/// `robot i robot j measurement information` as a g2o line; robots count from 1.
+fn closure(line: &str) -> String {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let [a, i, b, j, rest @ ..] = words.as_slice() else { return line.to_owned() };
+    let robot = |text: &str| text.parse::<u64>().unwrap_or(1).saturating_sub(1);
+    format!("EDGE_SE3:QUAT {} {} {}", symbol(robot(a), i), symbol(robot(b), j), rest.join(" "))
 }
 
 /// SE-Sync's objective by graph, from `optima.csv` in the folder; empty if there is none.
@@ -52,6 +99,16 @@ pub(super) fn find(root: &Path, optima: &BTreeMap<String, f64>, filter: &str) ->
     let mut folders = vec![root.to_path_buf()];
     while let Some(folder) = folders.pop() {
         let mut files = Vec::new();
+        let closures = folder.join("inter_agent_lc.dat");
+        if closures.is_file() {
+            let graph = |path: PathBuf| path.join("posegraph.g2o");
+            let robots = std::fs::read_dir(&folder)?.filter_map(|entry| Some(graph(entry.ok()?.path())));
+            let mut files: Vec<PathBuf> = robots.filter(|path| path.is_file()).collect();
+            files.sort();
+            let name = folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+            found.push(Source { name, files, full: None, closures: Some(closures) });
+            continue;
+        }
         for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
             let path = entry?.path();
             if path.is_dir() {
@@ -62,14 +119,17 @@ pub(super) fn find(root: &Path, optima: &BTreeMap<String, f64>, filter: &str) ->
         }
         files.sort();
         let relative = folder.strip_prefix(root).unwrap_or(&folder);
-        let name = relative.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_");
+        let name = relative.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_") + ".g2o";
         if optima.contains_key(&name) {
-            let full = files.iter().find(|f| f.file_stem().is_some_and(|stem| stem == "fullGraph")).cloned();
-            found.push(Source { name, files: full.map_or(files, |full| vec![full]) });
+            let is_full = |f: &PathBuf| f.file_stem().is_some_and(|stem| stem == "fullGraph");
+            let (full, files) = files.into_iter().partition::<Vec<_>, _>(is_full);
+            found.push(Source { name, files, full: full.into_iter().next(), closures: None });
         } else {
             let single = |path: PathBuf| Source {
                 name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
                 files: vec![path],
+                full: None,
+                closures: None,
             };
             found.extend(files.into_iter().map(single).filter(|s| optima.is_empty() || optima.contains_key(&s.name)));
         }

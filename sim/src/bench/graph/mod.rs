@@ -4,6 +4,7 @@ mod files;
 mod measure;
 mod peer;
 mod scale;
+mod spoil;
 mod swarm;
 mod table;
 
@@ -21,17 +22,20 @@ pub struct GraphBench {
     pub data: Option<PathBuf>,
     /// Instead of files, a swarm of so many robots and anchors each, which then grows anchor by anchor: batch solve,
     /// covariances, single updates, memory. Exit code 1 if the grown estimate is not that of a batch solve
-    #[arg(long, value_name = "ROBOTSxANCHORS", conflicts_with = "data")]
+    #[arg(long, value_name = "ROBOTSxANCHORS", conflicts_with_all = ["data", "spoil", "peer_python"])]
     pub scale: Option<scale::Size>,
-    /// The swarm's seed
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..1 << 62))]
-    pub seed: u64,
     /// Only graphs whose name contains this
     #[arg(long, value_name = "STR", default_value = "")]
     pub filter: String,
     /// Measure GTSAM on the same graphs, in this Python interpreter
     #[arg(long, value_name = "PYTHON")]
     pub peer_python: Option<PathBuf>,
+    /// Replace this share of the closures between robots by random ones, %, and solve robustly instead
+    #[arg(long, value_name = "PERCENT", conflicts_with = "peer_python", value_parser = clap::value_parser!(u32).range(0..=99))]
+    pub spoil: Option<u32>,
+    /// The seed that the random closures, or the swarm, are drawn from
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
     /// Solves of each kind; the fastest counts, for us and for the peer
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=20))]
     pub repeats: u8,
@@ -51,15 +55,30 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
     let optima = files::optima(data)?;
     let sources = files::find(data, &optima, &options.filter)?;
     let bar = progress_bar(sources.len() as u64, "graphs")?;
+    if let Some(percent) = options.spoil {
+        let mut rows = Vec::new();
+        for source in &sources {
+            rows.extend(spoil::measure(source, percent, options.seed)?);
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        write!(std::io::stdout().lock(), "{}", spoil::table(percent, options.seed, &rows))?;
+        return Ok(rows.iter().all(spoil::Spoiled::is_good));
+    }
     let mut rows = Vec::new();
     for source in &sources {
-        let graph = source.read()?;
+        let mut graph = source.read()?;
+        let isotropic = !graph.has_covariances();
+        if isotropic {
+            graph = graph.isotropic();
+        }
         let measured = measure::measure(&graph, options.repeats)?;
-        let peer = match &options.peer_python {
-            Some(python) if source.files.len() == 1 => Some(peer::measure(python, &source.files[0], options.repeats)?),
-            _ => None,
+        let peer = match options.peer_python.as_deref().zip(source.one_file()).filter(|_| !isotropic) {
+            Some((python, file)) => Some(peer::measure(python, file, options.repeats)?),
+            None => None,
         };
-        rows.push(table::Row { name: source.name.clone(), optimum: optima.get(&source.name).copied(), measured, peer });
+        let (name, optimum) = (source.name.clone(), optima.get(&source.name).copied());
+        rows.push(table::Row { name, optimum, isotropic, measured, peer });
         bar.inc(1);
     }
     bar.finish_and_clear();

@@ -11,6 +11,8 @@ const OPTIMUM_TOLERANCE: f64 = 1e-6;
 pub(super) struct Row {
     pub(super) name: String,
     pub(super) optimum: Option<f64>,
+    /// The file's information is not positive definite: isotropic weights stand in its place.
+    pub(super) isotropic: bool,
     pub(super) measured: Measured,
     pub(super) peer: Option<Peer>,
 }
@@ -64,7 +66,7 @@ pub(super) fn table(rows: &[Row]) -> String {
             "{:<40} {:>16.6} {:>5} {:>9.1} {:>16.6}",
             tail(&row.name),
             m.chi2,
-            format!("{}{}", m.iterations, if m.converged { "" } else { "!" }),
+            format!("{}{}{}", if row.isotropic { "*" } else { "" }, m.iterations, if m.converged { "" } else { "!" }),
             1e3 * m.solve_s,
             m.chi2_certified
         );
@@ -84,7 +86,8 @@ pub(super) fn table(rows: &[Row]) -> String {
     }
     text + "F/opt: against the certified optimum of optima.csv; λ_min: smallest eigenvalue of the certificate; cpu: thread \
             time, start, factor and certificate included; ratio: the peer's time over ours; GTSAM starts at the file's \
-            values and its marginals are extrapolated where it takes long; !: did not converge\n"
+            values and its marginals are extrapolated where it takes long; !: did not converge; *: \
+            with isotropic weights, because the file's information is not positive definite\n"
 }
 
 /// The end of a long name, which tells graphs apart.

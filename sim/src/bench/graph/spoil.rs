@@ -1,0 +1,188 @@
+//! Multi-robot graphs whose loop closures between robots are partly replaced by random ones, solved as a swarm would:
+//! which closures are used, and what that does to the poses.
+
+use super::files::Source;
+use crate::bench::cpu::thread_seconds;
+use merganser_protocol::config::EstimateConfig;
+use merganser_protocol::estimate::posegraph::PoseGraph;
+use merganser_protocol::estimate::posegraph::robust::{Verdict, robot_of};
+use merganser_protocol::estimate::posegraph::solve::Start;
+use merganser_protocol::geometry::Se3;
+use nalgebra::{Matrix3, Vector3, Vector6};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+const ITERATIONS_MAX: usize = 100;
+
+/// What came of one spoiled graph.
+pub(super) struct Spoiled {
+    name: String,
+    robots: usize,
+    truths: usize,
+    lies: usize,
+    used_truths: usize,
+    used_lies: usize,
+    /// Components the robots ended in.
+    parts: usize,
+    /// RMS distance of poses from those of the unspoiled graph: ours, and of the solution told which are true, m.
+    ate: f64,
+    ate_told: f64,
+    cpu_s: f64,
+}
+
+/// Spoils a share of the closures between robots and solves.
+///
+/// # Errors
+/// A graph that cannot be solved even unspoiled.
+pub(super) fn measure(source: &Source, percent: u32, seed: u64) -> anyhow::Result<Option<Spoiled>> {
+    let clean = source.read_robots()?;
+    let between = |graph: &PoseGraph, k: usize| {
+        let m = &graph.measurements[k];
+        robot_of(m.i) != robot_of(m.j)
+    };
+    let closures: Vec<usize> = (0..clean.measurements.len()).filter(|&k| between(&clean, k)).collect();
+    if closures.is_empty() || clean.parts().len() != 1 {
+        return Ok(None);
+    }
+    let reference = solved(&clean)?;
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    let mut graph = clean.clone();
+    let lies = spoil(&mut graph, &closures, percent, &reference, rng);
+    let told = PoseGraph {
+        measurements: graph
+            .measurements
+            .iter()
+            .enumerate()
+            .filter(|(k, _)| !lies[*k])
+            .map(|(_, m)| m.clone())
+            .collect(),
+        ..graph.clone()
+    };
+    let ate_told = match told.parts().len() {
+        1 => ate(&reference, &solved(&told)?),
+        _ => f64::NAN,
+    };
+    let start = thread_seconds();
+    let out = graph.solve_robustly(&EstimateConfig { iterations_max: ITERATIONS_MAX, ..EstimateConfig::default() });
+    let cpu_s = thread_seconds() - start;
+    let used = |lie: bool| {
+        let counts = |&&k: &&usize| lies[k] == lie && matches!(out.verdicts[k], Verdict::Used(_));
+        closures.iter().filter(counts).count()
+    };
+    let all = out.components.iter().max_by_key(|c| c.len()).cloned().unwrap_or_default();
+    Ok(Some(Spoiled {
+        name: source.name.clone(),
+        robots: clean.poses.keys().map(|&id| robot_of(id)).collect::<std::collections::BTreeSet<_>>().len(),
+        truths: closures.iter().filter(|&&k| !lies[k]).count(),
+        lies: closures.iter().filter(|&&k| lies[k]).count(),
+        used_truths: used(false),
+        used_lies: used(true),
+        parts: out.components.len(),
+        ate: ate(&reference, &all),
+        ate_told,
+        cpu_s,
+    }))
+}
+
+/// Replaces closures by random ones between random poses of the same robots; which measurements are lies.
+fn spoil(
+    graph: &mut PoseGraph,
+    closures: &[usize],
+    percent: u32,
+    reference: &BTreeMap<u64, Se3>,
+    rng: &mut ChaCha8Rng,
+) -> Vec<bool> {
+    let of_robot = |robot: u8| graph.poses.keys().copied().filter(|&id| robot_of(id) == robot).collect::<Vec<_>>();
+    let poses: BTreeMap<u8, Vec<u64>> =
+        (0..=u8::MAX).map(|robot| (robot, of_robot(robot))).filter(|(_, list)| !list.is_empty()).collect();
+    let centre = reference.values().map(|t| t.translation).sum::<Vector3<f64>>() / reference.len().max(1) as f64;
+    let extent = reference.values().map(|t| (t.translation - centre).norm()).fold(1.0, f64::max);
+    let planar = reference.values().all(|t| t.translation.z.abs() < 1e-6);
+    let mut lies = vec![false; graph.measurements.len()];
+    for &k in closures {
+        if rng.next_u32() % 100 >= percent {
+            continue;
+        }
+        let uniform = |rng: &mut ChaCha8Rng| 2.0 * (f64::from(rng.next_u32()) / f64::from(u32::MAX)) - 1.0;
+        let mut xi = Vector6::from_fn(|_, _| uniform(rng));
+        xi *= std::f64::consts::PI;
+        let place = Vector3::new(uniform(rng), uniform(rng), uniform(rng)) * extent;
+        if planar {
+            (xi[3], xi[4]) = (0.0, 0.0);
+        }
+        let rotation = Se3::exp(&Vector6::new(0.0, 0.0, 0.0, xi[3], xi[4], xi[5])).rotation;
+        let m = &mut graph.measurements[k];
+        let any = |list: &[u64], rng: &mut ChaCha8Rng| list[rng.next_u32() as usize % list.len()];
+        (m.i, m.j) = (any(&poses[&robot_of(m.i)], rng), any(&poses[&robot_of(m.j)], rng));
+        m.t_i_j = Se3::new(rotation, if planar { Vector3::new(place.x, place.y, 0.0) } else { place });
+        m.printed = rotation.matrix();
+        lies[k] = true;
+    }
+    lies
+}
+
+fn solved(graph: &PoseGraph) -> anyhow::Result<BTreeMap<u64, Se3>> {
+    let start = graph.start(Start::Chordal, ITERATIONS_MAX)?;
+    let values = graph.minimise(&start, ITERATIONS_MAX)?.values;
+    Ok(graph.poses.keys().copied().zip(values).collect())
+}
+
+/// RMS distance of positions after the best rigid alignment.
+fn ate(reference: &BTreeMap<u64, Se3>, found: &BTreeMap<u64, Se3>) -> f64 {
+    let pairs: Vec<(Vector3<f64>, Vector3<f64>)> =
+        found.iter().filter_map(|(id, t)| Some((reference.get(id)?.translation, t.translation))).collect();
+    let n = pairs.len().max(1) as f64;
+    let (a, b) =
+        (pairs.iter().map(|p| p.0).sum::<Vector3<f64>>() / n, pairs.iter().map(|p| p.1).sum::<Vector3<f64>>() / n);
+    let cross: Matrix3<f64> = pairs.iter().map(|(x, y)| (x - a) * (y - b).transpose()).sum();
+    let svd = cross.svd(true, true);
+    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else { return f64::NAN };
+    let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
+    let rotation = u * flip * v_t;
+    (pairs.iter().map(|(x, y)| (x - a - rotation * (y - b)).norm_squared()).sum::<f64>() / n).sqrt()
+}
+
+impl Spoiled {
+    /// Whether what was used is nearly all true and nearly all that is, and the poses are as if it had been told.
+    pub(super) fn is_good(&self) -> bool {
+        self.precision() >= 0.99 && self.recall() >= 0.95 && self.parts == 1
+    }
+
+    fn precision(&self) -> f64 {
+        self.used_truths as f64 / (self.used_truths + self.used_lies).max(1) as f64
+    }
+
+    fn recall(&self) -> f64 {
+        self.used_truths as f64 / self.truths.max(1) as f64
+    }
+}
+
+/// The rows as text.
+pub(super) fn table(percent: u32, seed: u64, rows: &[Spoiled]) -> String {
+    let mut text = format!(
+        "{percent} % of the closures between robots replaced by random ones, seed {seed}\n\
+         {:<44} {:>6} {:>6} {:>6} {:>9} {:>9} {:>6} {:>9} {:>9} {:>9}\n",
+        "", "robots", "true", "false", "precision", "recall", "parts", "ATE m", "told m", "cpu ms"
+    );
+    for row in rows {
+        let skip = row.name.chars().count().saturating_sub(44);
+        let _ = writeln!(
+            text,
+            "{:<44} {:>6} {:>6} {:>6} {:>9.4} {:>9.4} {:>6} {:>9.4} {:>9.4} {:>9.0}",
+            row.name.chars().skip(skip).collect::<String>(),
+            row.robots,
+            row.truths,
+            row.lies,
+            row.precision(),
+            row.recall(),
+            row.parts,
+            row.ate,
+            row.ate_told,
+            1e3 * row.cpu_s
+        );
+    }
+    text + "precision, recall: of closures between robots that count in the estimate; ATE: RMS distance of all poses from \
+            the unspoiled graph's; told: of the solution from the true closures alone\n"
+}
