@@ -124,7 +124,7 @@ impl Graph {
         let mut sets = Disjoint::new(nodes.len());
         let mut edges = Vec::with_capacity(factors.len());
         for factor in factors {
-            let edge = Edge::new(factor, &index, unknown_scale)?;
+            let edge = Edge::new(factor, |id| index.get(&id).copied(), unknown_scale)?;
             sets.join(edge.i, edge.j);
             edges.push(edge);
         }
@@ -176,12 +176,17 @@ impl Graph {
     pub(super) fn edges(&self) -> &[Edge] {
         &self.factors
     }
+
+    pub(super) fn into_edges(self) -> Vec<Edge> {
+        self.factors
+    }
 }
 
 impl Edge {
-    fn new(
+    /// A factor between nodes whose numbers `index` knows.
+    pub(super) fn new(
         factor: Factor,
-        index: &BTreeMap<SubmapId, usize>,
+        index: impl Fn(SubmapId) -> Option<usize>,
         unknown_scale: &BTreeSet<FrameId>,
     ) -> Result<Self, GraphError> {
         let (i, j) = (factor.i, factor.j);
@@ -191,7 +196,7 @@ impl Edge {
         if i == j {
             return Err(GraphError::SelfLoop { i });
         }
-        let (Some(&a), Some(&b)) = (index.get(&i), index.get(&j)) else {
+        let (Some(a), Some(b)) = (index(i), index(j)) else {
             return Err(GraphError::UnknownNode { i, j });
         };
         let same_unit = i.frame == j.frame || !(unknown_scale.contains(&i.frame) || unknown_scale.contains(&j.frame));
@@ -290,7 +295,7 @@ pub(super) fn is_usable(t: &Relative) -> bool {
 }
 
 /// Total order of factors that depends on nothing but their content.
-fn canonical(a: &Factor, b: &Factor) -> core::cmp::Ordering {
+pub(super) fn canonical(a: &Factor, b: &Factor) -> core::cmp::Ordering {
     (a.i, a.j, a.label).cmp(&(b.i, b.j, b.label)).then_with(|| content_order(&a.t_i_j, &b.t_i_j))
 }
 

@@ -180,7 +180,7 @@ pub(super) fn is_rigid(a: FrameId, b: FrameId, unknown_scale: &BTreeSet<FrameId>
     a == b || !(unknown_scale.contains(&a) || unknown_scale.contains(&b))
 }
 
-fn relation(sim: Sim3, covariance: Matrix7, rigid: bool) -> Option<Relative> {
+pub(super) fn relation(sim: Sim3, covariance: Matrix7, rigid: bool) -> Option<Relative> {
     if rigid {
         let m: Matrix6<f64> = covariance.fixed_view::<6, 6>(0, 0).into_owned();
         let covariance = Covariance::new(floored(m)).ok()?;

@@ -4,6 +4,7 @@ pub mod certificate;
 pub mod chordal;
 pub mod frames;
 pub mod graph;
+pub mod incremental;
 mod intake;
 pub mod joint;
 mod loops;

@@ -8,7 +8,7 @@ use super::minimise::{Minimum, Normal, Objective, minimise};
 use super::sparse::{BlockPattern, Factor, Slot};
 use crate::geometry::Sim3;
 use crate::geometry::sim3::Vector7;
-use nalgebra::{Matrix6, SMatrix};
+use nalgebra::{Matrix6, SMatrix, Vector6};
 use std::sync::Arc;
 use thiserror::Error;
 
@@ -114,7 +114,7 @@ pub fn solve(graph: Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<So
 
 /// Which columns of a factor's Jacobians belong to a variable.
 #[derive(Clone, Copy)]
-enum Part {
+pub(super) enum Part {
     AnchorI,
     AnchorJ,
     ScaleI,
@@ -146,7 +146,7 @@ struct Rigid {
 
 impl<'a> System<'a> {
     fn new(graph: &'a Graph) -> Result<Self, SolveError> {
-        let parts: Vec<_> = graph.edges().iter().map(|e| parts_of(graph, e)).collect();
+        let parts: Vec<_> = graph.edges().iter().map(|e| variables_of(graph, e)).collect();
         let mut sizes = vec![6; graph.nodes().len().saturating_sub(1)];
         sizes.resize(sizes.len() + graph.scale_count(), 1);
         let pairs = parts
@@ -213,24 +213,39 @@ impl Objective for System<'_> {
     }
 }
 
-/// With `J_i = −J_j A`, `A = Ad((X_i⁻¹ X_j)⁻¹)`: `H_jj = J_jᵀ W J_j`, `H_ij = −Aᵀ H_jj`, `H_ii = Aᵀ H_jj A`.
+/// A factor's part of `H` and `g`, between anchors of fixed unit.
+pub(super) struct RigidTerm {
+    pub(super) ii: Matrix6<f64>,
+    pub(super) ij: Matrix6<f64>,
+    pub(super) jj: Matrix6<f64>,
+    pub(super) gradient_i: Vector6<f64>,
+    pub(super) gradient_j: Vector6<f64>,
+}
+
+impl RigidTerm {
+    /// With `J_i = −J_j A`, `A = Ad((X_i⁻¹ X_j)⁻¹)`: `H_jj = J_jᵀ W J_j`, `H_ij = −Aᵀ H_jj`, `H_ii = Aᵀ H_jj A`.
+    pub(super) fn new(edge: &Edge, values: &[Sim3]) -> Self {
+        let (residual, by_j, adjoint) = edge.linearise_rigid(values);
+        let information: Matrix6<f64> = edge.information.fixed_view::<6, 6>(0, 0).into_owned();
+        let left = by_j.transpose() * information;
+        let (jj, gradient_j) = (left * by_j, left * residual);
+        let ij = -(adjoint.transpose() * jj);
+        Self { ii: -(ij * adjoint), ij, jj, gradient_i: -(adjoint.transpose() * gradient_j), gradient_j }
+    }
+}
+
 fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal: &mut Normal) {
-    let (residual, by_j, adjoint) = edge.linearise_rigid(values);
-    let information: Matrix6<f64> = edge.information.fixed_view::<6, 6>(0, 0).into_owned();
-    let left = by_j.transpose() * information;
-    let (of_j, gradient) = (left * by_j, left * residual);
-    let crossed = adjoint.transpose() * of_j;
+    let term = RigidTerm::new(edge, values);
     if let Some((start, slot)) = j {
-        BlockPattern::add(&mut normal.h, slot, &of_j);
-        normal.g[start..start + 6].iter_mut().zip(&gradient).for_each(|(g, x)| *g += x);
+        BlockPattern::add(&mut normal.h, slot, &term.jj);
+        normal.g[start..start + 6].iter_mut().zip(&term.gradient_j).for_each(|(g, x)| *g += x);
     }
     if let Some((start, slot)) = i {
-        BlockPattern::add(&mut normal.h, slot, &(crossed * adjoint));
-        let gradient = adjoint.transpose() * gradient;
-        normal.g[start..start + 6].iter_mut().zip(&gradient).for_each(|(g, x)| *g -= x);
+        BlockPattern::add(&mut normal.h, slot, &term.ii);
+        normal.g[start..start + 6].iter_mut().zip(&term.gradient_i).for_each(|(g, x)| *g += x);
     }
     if let Some(slot) = cross {
-        BlockPattern::add(&mut normal.h, slot, &-crossed);
+        BlockPattern::add(&mut normal.h, slot, &term.ij);
     }
 }
 
@@ -255,7 +270,7 @@ fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[S
 }
 
 impl Part {
-    fn size(self) -> usize {
+    pub(super) fn size(self) -> usize {
         match self {
             Self::AnchorI | Self::AnchorJ => 6,
             Self::ScaleI | Self::ScaleJ | Self::ScaleBoth => 1,
@@ -263,26 +278,27 @@ impl Part {
     }
 }
 
-fn parts_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
+/// The variables of a factor: anchors without the first, then scales.
+fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
     let anchors = graph.nodes().len().saturating_sub(1);
-    let mut parts = Vec::with_capacity(4);
-    if edge.i > 0 {
-        parts.push((edge.i - 1, Part::AnchorI));
-    }
-    if edge.j > 0 {
-        parts.push((edge.j - 1, Part::AnchorJ));
-    }
-    match (graph.scale_of(edge.i), graph.scale_of(edge.j)) {
-        (Some(a), Some(b)) if a == b => parts.push((anchors + a, Part::ScaleBoth)),
-        (a, b) => {
-            parts.extend(a.map(|s| (anchors + s, Part::ScaleI)));
-            parts.extend(b.map(|s| (anchors + s, Part::ScaleJ)));
-        }
-    }
-    parts
+    let end = |node: usize| (node.checked_sub(1), graph.scale_of(node).map(|s| anchors + s));
+    parts_of(end(edge.i), end(edge.j)).into_iter().flatten().collect()
 }
 
-fn columns(part: Part, by_i: &SMatrix<f64, 7, 7>, by_j: &SMatrix<f64, 7, 7>) -> SMatrix<f64, 7, 6> {
+/// The variables of a factor between two anchors, each given as its own and its scale's variable, where they are free.
+pub(super) fn parts_of(
+    i: (Option<usize>, Option<usize>),
+    j: (Option<usize>, Option<usize>),
+) -> [Option<(usize, Part)>; 4] {
+    let scales = match (i.1, j.1) {
+        (Some(a), Some(b)) if a == b => [Some((a, Part::ScaleBoth)), None],
+        (a, b) => [a.map(|v| (v, Part::ScaleI)), b.map(|v| (v, Part::ScaleJ))],
+    };
+    [i.0.map(|v| (v, Part::AnchorI)), j.0.map(|v| (v, Part::AnchorJ)), scales[0], scales[1]]
+}
+
+/// The columns of a factor's Jacobians that belong to a variable; the first [`Part::size`] count.
+pub(super) fn columns(part: Part, by_i: &SMatrix<f64, 7, 7>, by_j: &SMatrix<f64, 7, 7>) -> SMatrix<f64, 7, 6> {
     let scale = |column: SMatrix<f64, 7, 1>| {
         let mut out = SMatrix::<f64, 7, 6>::zeros();
         out.set_column(0, &column);

@@ -6,18 +6,25 @@
 //! not a library's, because their updates are kept: a new measurement then refactorises only the path from its
 //! variables to the root.
 
+mod clique;
 mod dense;
 mod front;
 mod inverse;
 mod order;
+mod revise;
 #[cfg(test)]
 mod tests;
+mod tree;
+#[cfg(test)]
+mod tree_tests;
 
 use super::solve::SolveError;
+pub(super) use clique::Sum;
 pub(super) use front::{Factor, Workspace};
 pub(super) use inverse::SelectedInverse;
 use order::Elimination;
 use std::ops::Range;
+pub(super) use tree::{Before, CliqueTree, Terms};
 
 /// Where each block of `H` lies, and the symbolic factorisation of that pattern.
 ///

@@ -3,7 +3,9 @@
 mod files;
 mod measure;
 mod peer;
+mod scale;
 mod spoil;
+mod swarm;
 mod table;
 
 use crate::bar::progress_bar;
@@ -16,8 +18,12 @@ use std::path::PathBuf;
 pub struct GraphBench {
     /// Folder of g2o graphs, searched through; a folder of robots' files is one graph. Certified optima come from the
     /// optima.csv in it
-    #[arg(long, value_name = "DIR")]
-    pub data: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "scale")]
+    pub data: Option<PathBuf>,
+    /// Instead of files, a swarm of so many robots and anchors each, which then grows anchor by anchor: batch solve,
+    /// covariances, single updates, memory. Exit code 1 if the grown estimate is not that of a batch solve
+    #[arg(long, value_name = "ROBOTSxANCHORS", conflicts_with_all = ["data", "spoil", "peer_python"])]
+    pub scale: Option<scale::Size>,
     /// Only graphs whose name contains this
     #[arg(long, value_name = "STR", default_value = "")]
     pub filter: String,
@@ -27,8 +33,8 @@ pub struct GraphBench {
     /// Replace this share of the closures between robots by random ones, %, and solve robustly instead
     #[arg(long, value_name = "PERCENT", conflicts_with = "peer_python", value_parser = clap::value_parser!(u32).range(0..=99))]
     pub spoil: Option<u32>,
-    /// The seed that the random closures are drawn from
-    #[arg(long, default_value_t = 1, requires = "spoil")]
+    /// The seed that the random closures, or the swarm, are drawn from
+    #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Solves of each kind; the fastest counts, for us and for the peer
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=20))]
@@ -40,8 +46,14 @@ pub struct GraphBench {
 /// # Errors
 /// A folder, file or interpreter that cannot be used.
 pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
-    let optima = files::optima(&options.data)?;
-    let sources = files::find(&options.data, &optima, &options.filter)?;
+    if let Some(size) = options.scale {
+        let (text, is_good) = scale::run(size, options.seed)?;
+        write!(std::io::stdout().lock(), "{text}")?;
+        return Ok(is_good);
+    }
+    let Some(data) = &options.data else { anyhow::bail!("give --data or --scale") };
+    let optima = files::optima(data)?;
+    let sources = files::find(data, &optima, &options.filter)?;
     let bar = progress_bar(sources.len() as u64, "graphs")?;
     if let Some(percent) = options.spoil {
         let mut rows = Vec::new();
