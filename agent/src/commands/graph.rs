@@ -210,14 +210,12 @@ fn solve_robustly(args: &SolveArgs) -> Result<bool> {
     let seconds = began.elapsed().as_secs_f64();
     let count = |keep: fn(&Verdict) -> bool| solved.verdicts.iter().filter(|v| keep(v)).count();
     say(&format!(
-        "{} poses in {} parts; {} odometry, {} of {} other measurements used; σ as told × {:.2}, \
-         χ² {:.3} of {} dof, {}, {seconds:.3} s",
+        "{} poses in {} parts; {} odometry, {} of {} other measurements used; χ² {:.3} of {} dof, {}, {seconds:.3} s",
         graph.poses.len(),
         solved.components.len(),
         count(|v| *v == Verdict::Odometry),
         count(|v| matches!(v, Verdict::Used(_))),
         count(|v| *v != Verdict::Odometry),
-        solved.sigma_scale,
         solved.map.chi2,
         solved.map.dof,
         if solved.map.converged { "converged" } else { "NOT CONVERGED" },

@@ -9,6 +9,8 @@ pub mod robust;
 pub mod solve;
 
 #[cfg(test)]
+mod robust_tests;
+#[cfg(test)]
 mod tests;
 
 use super::chordal::{ChordalEdge, ChordalGraph};

@@ -11,13 +11,7 @@ use crate::estimate::{AgreedAlignment, FrameChain, JointEstimate, MapProblem, Un
 use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
 use crate::wire::fact::ScaleKind;
-use core::f64::consts::PI;
 use std::collections::BTreeMap;
-
-/// Factors by which all standard deviations of a graph may be grown, tried from 1 on.
-const SIGMA_SCALES: [f64; 3] = [1.0, 2.0, 4.0];
-/// The best factor is refined if the residuals ask for so much more or less.
-const REFINED_BEYOND: f64 = 0.1;
 
 /// What became of a measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -35,8 +29,6 @@ pub enum Verdict {
 pub struct RobustSolved {
     /// A verdict per measurement, in their order.
     pub verdicts: Vec<Verdict>,
-    /// By how much all standard deviations were grown: files often state what a front end assumed.
-    pub sigma_scale: f64,
     /// Robots' poses by component: `t_world_pose`, the world of each component its smallest pose's.
     pub components: Vec<BTreeMap<u64, Se3>>,
     /// The map.
@@ -51,52 +43,17 @@ pub fn robot_of(id: u64) -> u8 {
 }
 
 impl PoseGraph {
-    /// Solves the graph as a swarm would, at the noise scale that explains it best.
-    ///
-    /// The scale is judged by its evidence: the density of all residuals in use, with the freedom of the poses
-    /// marginalised, and of the measurements left out, spread evenly over what the graph spans.
+    /// Solves the graph as a swarm would.
     pub fn solve_robustly(&self, config: &EstimateConfig) -> RobustSolved {
-        let mut best = self.solve_scaled(config, SIGMA_SCALES[0]);
-        for scale in SIGMA_SCALES.into_iter().skip(1) {
-            best = self.better(best, self.solve_scaled(config, scale));
-        }
-        let asked = (best.map.chi2 / best.map.dof.max(1) as f64).sqrt();
-        let refined = (best.sigma_scale * asked).max(1.0);
-        if best.map.dof > 0 && (refined / best.sigma_scale - 1.0).abs() > REFINED_BEYOND {
-            best = self.better(best, self.solve_scaled(config, refined));
-        }
-        best
-    }
-
-    fn better(&self, a: RobustSolved, b: RobustSolved) -> RobustSolved {
-        if self.log_evidence(&b) > self.log_evidence(&a) { b } else { a }
-    }
-
-    /// Log evidence of a solution against all loops being spread evenly.
-    fn log_evidence(&self, solved: &RobustSolved) -> f64 {
-        let spans = || self.measurements.iter().map(|m| m.t_i_j.translation.norm());
-        // A cube as wide as the longest measurement is long both ways, and all rotations (8π²).
-        let log_volume = libm::log((2.0 * spans().fold(1e-3, f64::max)).powi(3) * 8.0 * PI * PI);
-        let used = self.measurements.iter().zip(&solved.verdicts).filter(|(_, v)| matches!(v, Verdict::Used(_)));
-        let gain = |m: &Measurement| {
-            let log_det: f64 =
-                m.information.cholesky().map_or(0.0, |l| l.l().diagonal().iter().map(|&x| libm::log(x)).sum());
-            log_volume + log_det - 3.0 * libm::log(2.0 * PI)
-        };
-        let gains: f64 = used.map(|(m, _)| gain(m)).sum();
-        gains - 0.5 * solved.map.chi2 - solved.map.dof as f64 * libm::log(solved.sigma_scale)
-    }
-
-    fn solve_scaled(&self, config: &EstimateConfig, sigma_scale: f64) -> RobustSolved {
         let odometry = self.odometry();
         let anchors = self.anchors(&odometry);
-        let frames = self.frames(&odometry, &anchors, sigma_scale);
+        let frames = self.frames(&odometry, &anchors);
         let mut verdicts = vec![Verdict::Unused(Unused::NotFinite); self.measurements.len()];
         odometry.values().for_each(|&k| verdicts[k] = Verdict::Odometry);
         let agreed = |(k, m): (usize, &Measurement)| {
             let (i, j) = (anchors[&m.i], anchors[&m.j]);
             let entry = EntryId { frame: i.frame.max(j.frame), seq: k as u32 };
-            Some(AgreedAlignment { entry, i, j, t_i_j: Relative::Metric(measured(m, sigma_scale)?) })
+            Some(AgreedAlignment { entry, i, j, t_i_j: Relative::Metric(measured(m)?) })
         };
         let loops = self.measurements.iter().enumerate().filter(|(k, _)| verdicts[*k] != Verdict::Odometry);
         let problem = MapProblem { frames, alignments: loops.filter_map(agreed).collect(), sightings: Vec::new() };
@@ -107,7 +64,7 @@ impl PoseGraph {
             }
         }
         let components = components(&anchors, &map);
-        RobustSolved { verdicts, sigma_scale, components, map, anchors }
+        RobustSolved { verdicts, components, map, anchors }
     }
 
     /// The measurement that ties each pose to the robot's next one: the first of them in the file.
@@ -146,7 +103,6 @@ impl PoseGraph {
         &self,
         odometry: &BTreeMap<u64, usize>,
         anchors: &BTreeMap<u64, SubmapId>,
-        sigma_scale: f64,
     ) -> BTreeMap<FrameId, FrameChain> {
         let mut out: BTreeMap<FrameId, FrameChain> = BTreeMap::new();
         let mut step = None;
@@ -158,7 +114,7 @@ impl PoseGraph {
             }
             step = odometry.get(&id).and_then(|&k| {
                 let m = &self.measurements[k];
-                let t = measured(m, sigma_scale)?;
+                let t = measured(m)?;
                 Some(if m.i == id { t } else { t.inverse() })
             });
         }
@@ -166,9 +122,8 @@ impl PoseGraph {
     }
 }
 
-fn measured(m: &Measurement, sigma_scale: f64) -> Option<PoseWithCovariance> {
-    let covariance = covariance_of(&m.information)?.scaled(sigma_scale * sigma_scale);
-    Some(PoseWithCovariance { pose: m.t_i_j, covariance })
+fn measured(m: &Measurement) -> Option<PoseWithCovariance> {
+    Some(PoseWithCovariance { pose: m.t_i_j, covariance: covariance_of(&m.information)? })
 }
 
 /// Poses by component, in the coordinates of its smallest pose.
