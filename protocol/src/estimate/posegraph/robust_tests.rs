@@ -1,6 +1,7 @@
 //! Robust solving of graphs in files: what is used, what is left out, and how frames begin.
 
 use super::robust::{Verdict, robot_of};
+use super::solve::Start;
 use super::*;
 use crate::config::EstimateConfig;
 use crate::geometry::se3;
@@ -78,4 +79,36 @@ fn a_gap_in_the_odometry_begins_a_new_frame() {
     assert_eq!(sizes, [8, 16, 24]);
     assert_eq!(solved.anchors[&id(b'a', 8)].frame.epoch, 1);
     assert!(solved.components.iter().all(|c| c.keys().all(|&k| robot_of(k) == robot_of(*c.keys().next().unwrap()))));
+}
+
+#[test]
+fn of_more_closures_than_a_pair_weighs_the_map_admits_the_true_ones() {
+    // Odometry as in `walk`; 40 true and 40 false closures between all kinds of poses.
+    let mut graph = walk(5, 10);
+    let odometry = 2 * (POSES as usize - 1);
+    let truth = walk_truth(&graph, odometry);
+    let (sample, n) = (graph.measurements[odometry].clone(), 40);
+    graph.measurements.truncate(odometry);
+    for (k, lie) in (0..n).map(|k| (k, false)).chain((0..n).map(|k| (k, true))) {
+        let (i, j) = (id(b'a', k % POSES), id(b'b', (5 * k + k / POSES + if lie { 11 } else { 0 }) % POSES));
+        let off = if lie {
+            Vector6::new(2.0, k as f64 * 0.2 - 4.0, 1.0, 0.0, 0.0, 0.1 * k as f64 - 2.0)
+        } else {
+            Vector6::zeros()
+        };
+        let t_i_j = (truth[&i].inverse() * truth[&j]).retract(&off);
+        graph.measurements.push(Measurement { i, j, t_i_j, ..sample.clone() });
+    }
+    let solved = graph.solve_robustly(&EstimateConfig::default());
+    let (truths, lies) = solved.verdicts[odometry..].split_at(n as usize);
+    assert!(truths.iter().filter(|v| is_used(v)).count() >= 38, "{truths:?}");
+    assert!(!lies.iter().any(is_used), "{lies:?}");
+}
+
+/// Poses that the odometry and the first true closures give, as good as true.
+fn walk_truth(graph: &PoseGraph, odometry: usize) -> BTreeMap<u64, Se3> {
+    let measurements = graph.measurements[..odometry + 10].to_vec();
+    let told = PoseGraph { measurements, ..graph.clone() };
+    let values = told.minimise(&told.start(Start::Relaxed, 50).unwrap(), 50).unwrap().values;
+    told.poses.keys().copied().zip(values).collect()
 }

@@ -1,4 +1,5 @@
-//! The dense kernels of one front: faer's, on column-major panels.
+//! The dense kernels of one front: faer's, on column-major panels. They follow the processor's vector units, so that two
+//! kinds of processor agree to rounding and not to the bit (DESIGN §7 asks 1e-9); on one kind they do, to the bit.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{LltError, LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
