@@ -9,6 +9,7 @@ pub mod graph;
 pub mod outliers;
 pub mod peer;
 pub mod peers;
+pub mod places;
 pub mod registration;
 pub mod row;
 pub mod solve;
@@ -37,6 +38,11 @@ pub enum Bench {
     /// Exit code 1 if a graph did not converge, was not certified, or missed its known optimum; 2 if a file cannot be
     /// used.
     Graph(graph::GraphBench),
+    /// Seeing the same place on recorded data: alignments, candidates, bytes and time, beside KISS-Matcher
+    ///
+    /// Alignments are one way: one submap's keypoints against the other's features. Times are of the processor. Exit code 1
+    /// if a wrong alignment was accepted or fewer were found than promised, 2 if the data cannot be used.
+    Places(places::Places),
     /// A flood of unknown ids: how much slower honest robots converge, and how much memory it takes
     ///
     /// The same swarm of real agents runs without and with 10,000 messages of strangers a second at two of its robots,
@@ -65,6 +71,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Registration(options) => registration::run(&options),
         Bench::Gossip(options) => gossip::run(&options),
         Bench::Graph(options) => graph::run(&options),
+        Bench::Places(options) => places::run(&options),
         Bench::Flood(options) => flood::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }
