@@ -56,7 +56,7 @@ const LOG10: f64 = core::f64::consts::LOG10_E;
 pub struct RegisterConfig {
     /// The σ-consensus on mutual matches; its `sigma_max` is in frame units.
     pub solver: SolverConfig,
-    /// Least score, nats. Measured: right poses of submaps that overlap by a quarter from 70 on, wrong ones up to 41.
+    /// Least score, nats. Measured: right poses of submaps that overlap by a quarter from 64 on, wrong ones up to 51.
     pub score_min: f64,
     /// Least share of the keypoints with a point of mine near. Submaps that overlap by less than a sixth fall below.
     pub fit_min: f64,
@@ -75,7 +75,7 @@ impl Default for RegisterConfig {
     fn default() -> Self {
         Self {
             solver: SolverConfig::default(),
-            score_min: 50.0,
+            score_min: 60.0,
             fit_min: 0.2,
             contradiction_max: 0.06,
             rival_ratio: 0.8,

@@ -92,7 +92,7 @@ pub fn least_axis(&[xx, xy, xz, yy, yz, zz]: &[f64; 6]) -> Option<(Vector3<f64>,
     let mean = (xx + yy + zz) / 3.0;
     let (a, b, c) = (xx - mean, yy - mean, zz - mean);
     let size = ((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0).sqrt();
-    if !(size > 1e-9) {
+    if size.is_nan() || size <= 1e-9 {
         return None;
     }
     let determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz);

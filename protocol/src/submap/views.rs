@@ -73,7 +73,7 @@ impl View {
         let offset = at - self.from;
         let axis = offset.iamax();
         let depth = offset[axis].abs();
-        if !(depth > 1e-6) {
+        if depth.is_nan() || depth <= 1e-6 {
             return None;
         }
         let face = 2 * axis + usize::from(offset[axis] < 0.0);

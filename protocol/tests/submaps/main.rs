@@ -16,7 +16,7 @@ use world::World;
 
 /// Keypoints that fit a blob of 7 kB, and the default number.
 const SMALL: usize = 332;
-const DEFAULT: usize = 512;
+const DEFAULT: usize = 384;
 
 #[test]
 fn rooms_seen_by_a_depth_camera_are_aligned_from_7_kb() {
