@@ -321,10 +321,17 @@ impl Agent {
         self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
     }
 
-    /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide.
+    /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide, and
+    /// no later run may take this log for one to go on with: what we hold of it may be less than others do.
     fn meet_own_past(&mut self, id: EntryId) {
-        if id.frame.robot == self.me.robot && id.frame.epoch >= self.me.frame.epoch {
-            self.begin_epoch(id.frame.epoch.saturating_add(1));
+        let FrameId { robot, epoch } = id.frame;
+        if robot != self.me.robot {
+            return;
+        }
+        if epoch >= self.me.frame.epoch {
+            self.begin_epoch(epoch.saturating_add(1));
+        } else {
+            self.ledger.open.push(Record::EpochClosed { epoch });
         }
     }
 

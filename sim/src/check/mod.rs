@@ -106,6 +106,8 @@ pub struct RobotSample {
     pub disk_bytes: u64,
     /// What it believes.
     pub snapshot: Option<Snapshot>,
+    /// It measures falsehoods, and so lies to itself: between two frames of its own there is no second witness.
+    pub lies: bool,
 }
 
 /// A broken invariant.
@@ -216,6 +218,7 @@ pub(crate) mod tests {
             logs: BTreeMap::new(),
             disk_bytes: 0,
             snapshot: Some(snapshot),
+            lies: false,
         }
     }
 

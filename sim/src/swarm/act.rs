@@ -240,7 +240,8 @@ impl<C: Core> Swarm<C> {
         let incarnation = self.robots[robot].incarnation;
         match output {
             Output::Persist { batch, records } => {
-                self.robots[robot].hands_over(batch, &records);
+                let writes = self.robots[robot].core.as_ref().map(|core| core.frame().epoch);
+                self.robots[robot].hands_over(writes, batch, &records);
                 let store = &mut self.robots[robot].store;
                 store.accept(batch, records);
                 // What comes while a commit is on its way shares it.
