@@ -200,7 +200,7 @@ fn weight(batch: &Batch) -> usize {
     let bytes = |record: &Record| match record {
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } | Record::Private { bytes, .. } => bytes.len(),
         Record::Fork { proof, .. } => proof.iter().map(Vec::len).sum(),
-        Record::EpochClosed { .. } => 0,
+        Record::EpochClosed { .. } | Record::Replaced { .. } => 0,
     };
     batch.records.iter().map(bytes).sum()
 }

@@ -3,7 +3,7 @@
 
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, SubmapConfig};
-use crate::estimate::joint::{EdgeEstimate, MapProblem, PairEstimate, solve_map};
+use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, solve_map};
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use crate::submap::{self, Described, Features, Keypoints, RefineConfig, Submap};
@@ -87,6 +87,23 @@ pub struct Solved {
     pub dof: usize,
     /// Anchors.
     pub nodes: usize,
+}
+
+impl Solved {
+    /// The submaps by their indices, where the problem counted places in a chain that has gaps.
+    pub(super) fn with_indices(mut self, gaps: &BTreeMap<FrameId, Vec<u32>>) -> Self {
+        let index = |id: SubmapId| {
+            let there = gaps.get(&id.frame).and_then(|chain| chain.get(id.index as usize));
+            there.map_or(id, |index| SubmapId { index: *index, ..id })
+        };
+        if !gaps.is_empty() {
+            self.anchors = self.anchors.into_iter().map(|(id, t)| (index(id), t)).collect();
+            for AgreedAlignment { i, j, .. } in self.edges.iter_mut().map(|edge| &mut edge.measurement) {
+                (*i, *j) = (index(*i), index(*j));
+            }
+        }
+        self
+    }
 }
 
 /// Where a frame is.

@@ -41,7 +41,7 @@ impl Agent {
             id: self.me.robot.to_string(),
             epoch: self.me.frame.epoch,
             neighbours: self.gossip.spread.neighbours().map(|robot| self.robot_name(robot)).collect(),
-            entries: self.replica.count(),
+            entries: self.replica.held(),
             digest: self.replica.digest().to_string(),
             submaps: self.negotiation.own().count() as u64,
             keyframes: self.mapper.keyframes,

@@ -30,6 +30,6 @@ mod joint_tests;
 #[cfg(test)]
 mod solve_tests;
 #[cfg(test)]
-mod test_graphs;
+pub(crate) mod test_graphs;
 #[cfg(test)]
-mod test_world;
+pub(crate) mod test_world;

@@ -6,6 +6,7 @@ mod closed;
 mod contract;
 mod converged;
 mod durable_first;
+mod floors;
 mod honest_covariance;
 mod merged_as_expected;
 mod never_back;
@@ -133,6 +134,7 @@ impl Checks {
             Box::<unique_entries::UniqueEntries>::default(),
             Box::<never_back::NeverBack>::default(),
             Box::<closed::Closed>::default(),
+            Box::<floors::Floors>::default(),
             Box::<bounded::Bounded>::default(),
             Box::new(same_facts::SameFacts),
             Box::new(same_estimate::SameEstimate),

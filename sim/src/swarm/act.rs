@@ -299,6 +299,7 @@ impl<C: Core> Swarm<C> {
             }
             Output::Event(event) => {
                 self.counts.epochs_begun += u64::from(matches!(event, Told::EpochBegan { .. }));
+                self.counts.condensed += u64::from(matches!(event, Told::Condensed { .. }));
                 self.counts.forks += u64::from(is_fork(&event));
                 if self.told.len() < TOLD_MAX {
                     self.told.push((now.as_secs_f64(), robot, event));
