@@ -53,7 +53,12 @@ fn tell(report: &Report) {
     let (damaged, entries_lost) = (report.damaged_count, report.entries_lost);
     match &report.unmended {
         None => error!(damaged, entries_lost, "the store was damaged: it was written anew without what was not sound"),
-        Some(reason) => error!(damaged, entries_lost, reason, "the store is damaged and cannot be written anew"),
+        Some(reason) => error!(
+            damaged,
+            entries_lost,
+            reason,
+            "the store is damaged and cannot be written anew: make room, until then nothing is stored"
+        ),
     }
 }
 
