@@ -11,6 +11,7 @@ pub mod peer;
 pub mod peers;
 pub mod registration;
 pub mod row;
+pub mod share;
 pub mod solve;
 pub mod table;
 
@@ -37,6 +38,11 @@ pub enum Bench {
     /// Exit code 1 if a graph did not converge, was not certified, or missed its known optimum; 2 if a file cannot be
     /// used.
     Graph(graph::GraphBench),
+    /// Pose graphs split among robots who share their measurements: bytes sent until all have the whole optimum
+    ///
+    /// Exit code 1 if a robot's minimum is not that of the whole graph (1e-9), or robots differ; 2 if a file cannot be
+    /// used.
+    Share(share::Share),
     /// A flood of unknown ids: how much slower honest robots converge, and how much memory it takes
     ///
     /// The same swarm of real agents runs without and with 10,000 messages of strangers a second at two of its robots,
@@ -65,6 +71,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Registration(options) => registration::run(&options),
         Bench::Gossip(options) => gossip::run(&options),
         Bench::Graph(options) => graph::run(&options),
+        Bench::Share(options) => share::run(&options),
         Bench::Flood(options) => flood::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }
