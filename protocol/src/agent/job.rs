@@ -4,6 +4,7 @@
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, SubmapConfig};
 use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, solve_map};
+use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use crate::submap::{self, Described, Features, Keypoints, RefineConfig, Submap};
@@ -87,6 +88,8 @@ pub struct Solved {
     pub dof: usize,
     /// Anchors.
     pub nodes: usize,
+    /// Whether it is proved to be the global optimum.
+    pub optimality: Optimality,
 }
 
 impl Solved {
@@ -166,6 +169,7 @@ impl SolveJob {
             chi2: estimate.chi2,
             dof: estimate.dof,
             nodes: estimate.nodes,
+            optimality: estimate.optimality(),
         }
     }
 }

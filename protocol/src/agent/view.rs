@@ -198,7 +198,13 @@ impl Agent {
         }
         edges.extend(self.unused_edges(&listed));
         let nodes = solved.nodes + self.map.alone.values().sum::<usize>();
-        GraphView { nodes: nodes as u64, chi2: solved.chi2, dof: solved.dof as u64, edges }
+        GraphView {
+            nodes: nodes as u64,
+            chi2: solved.chi2,
+            dof: solved.dof as u64,
+            optimality: solved.optimality,
+            edges,
+        }
     }
 
     /// Alignments that did not enter the estimate, with the reason.

@@ -10,6 +10,7 @@ pub mod joint;
 mod loops;
 pub mod marginals;
 mod minimise;
+pub mod optimality;
 mod pairs;
 pub mod posegraph;
 pub mod residual;

@@ -210,7 +210,7 @@ pub(crate) mod tests {
             frames,
             poses: PosesView { robots: Vec::new() },
             map: MapView { submaps: Vec::new() },
-            graph: GraphView { nodes: 0, chi2: 0.0, dof: 0, edges: Vec::new() },
+            graph: GraphView { nodes: 0, chi2: 0.0, dof: 0, optimality: Default::default(), edges: Vec::new() },
             stats: StatsView::default(),
         };
         RobotSample {
