@@ -333,6 +333,9 @@ fn tell(event: &Event) {
         Event::Merged { frame } => info!(%frame, "merged"),
         Event::Unmerged { frame } => warn!(%frame, "no longer merged"),
         Event::EpochBegan { frame } => info!(%frame, "a new epoch begins"),
+        Event::Condensed { frame, parts, submaps_gone, bytes: [before, after] } => {
+            info!(%frame, parts, submaps_gone, before, after, "log condensed");
+        }
         Event::SubmapFinished { submap, keypoints } => info!(%submap, keypoints, "submap finished"),
         Event::AlignmentAgreed { i, j } => info!(%i, %j, "alignment agreed"),
         Event::AlignmentDisputed { i, j } => warn!(%i, %j, "alignment disputed"),

@@ -76,6 +76,8 @@ pub enum StoredRecord {
     Fork(FrameId, [Vec<u8>; 2]),
     /// Own epochs that must not be continued.
     EpochClosed(u32),
+    /// What a log's writer has replaced.
+    Replaced(EntryId, Vec<SubmapId>, Vec<Hash>),
 }
 
 impl From<&Record> for StoredRecord {
@@ -86,6 +88,7 @@ impl From<&Record> for StoredRecord {
             Record::Private { submap, bytes } => Self::Private(*submap, bytes.clone()),
             Record::Fork { frame, proof } => Self::Fork(*frame, proof.clone()),
             Record::EpochClosed { epoch } => Self::EpochClosed(*epoch),
+            Record::Replaced { below, submaps, blobs } => Self::Replaced(*below, submaps.clone(), blobs.clone()),
         }
     }
 }
@@ -98,6 +101,7 @@ impl From<StoredRecord> for Record {
             StoredRecord::Private(submap, bytes) => Self::Private { submap, bytes },
             StoredRecord::Fork(frame, proof) => Self::Fork { frame, proof },
             StoredRecord::EpochClosed(epoch) => Self::EpochClosed { epoch },
+            StoredRecord::Replaced(below, submaps, blobs) => Self::Replaced { below, submaps, blobs },
         }
     }
 }

@@ -53,7 +53,12 @@ fn tell(report: &Report) {
     let (damaged, entries_lost) = (report.damaged_count, report.entries_lost);
     match &report.unmended {
         None => error!(damaged, entries_lost, "the store was damaged: it was written anew without what was not sound"),
-        Some(reason) => error!(damaged, entries_lost, reason, "the store is damaged and cannot be written anew"),
+        Some(reason) => error!(
+            damaged,
+            entries_lost,
+            reason,
+            "the store is damaged and cannot be written anew: make room, until then nothing is stored"
+        ),
     }
 }
 
@@ -200,7 +205,7 @@ fn weight(batch: &Batch) -> usize {
     let bytes = |record: &Record| match record {
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } | Record::Private { bytes, .. } => bytes.len(),
         Record::Fork { proof, .. } => proof.iter().map(Vec::len).sum(),
-        Record::EpochClosed { .. } => 0,
+        Record::EpochClosed { .. } | Record::Replaced { .. } => 0,
     };
     batch.records.iter().map(bytes).sum()
 }

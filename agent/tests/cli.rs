@@ -87,3 +87,31 @@ fn the_commented_defaults_are_the_defaults() {
         assert!(full.lines().any(|l| l.starts_with(&format!("{name} = "))), "default.toml does not show {name}");
     }
 }
+
+#[test]
+#[cfg(target_os = "linux")]
+fn a_graph_of_ten_million_edges_is_refused_before_it_fills_memory() {
+    use std::io::{BufWriter, Write};
+    use std::process::Stdio;
+    // 2 GiB of address space; ten million edges would take more than 4.
+    let limited = "ulimit -v 2097152; exec \"$0\" graph solve /dev/stdin";
+    let mut child = Command::new("sh")
+        .args(["-c", limited, env!("CARGO_BIN_EXE_merganser")])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut pipe = BufWriter::new(child.stdin.take().unwrap());
+    let edge = |k: u32| {
+        let (i, step) = (k % 100_000, 1 + k / 100_000);
+        format!("EDGE_SE3:QUAT {i} {} 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1", i + step)
+    };
+    // It stops reading long before the end.
+    let taken = (0..10_000_000).take_while(|&k| writeln!(pipe, "{}", edge(k)).is_ok()).count();
+    drop(pipe);
+    let told = child.wait_with_output().unwrap();
+    assert_eq!(told.status.code(), Some(1), "{}", text(&told.stderr));
+    assert!(text(&told.stderr).contains("more than 500000 measurements; split the graph"), "{}", text(&told.stderr));
+    assert!((500_000..600_000).contains(&taken), "{taken}");
+}

@@ -134,6 +134,8 @@ pub struct GossipConfig {
     pub blob_bytes_per_sec: f64,
     /// How long an unanswered question is waited for.
     pub answer_secs: f64,
+    /// Entries of our own log from which on it is replaced by what still counts of it; 0 for never.
+    pub condense_entries: u32,
     /// Entries held per robot and epoch at most.
     pub entries_per_frame_max: u32,
     /// Epochs held per robot at most.
@@ -148,6 +150,7 @@ impl Default for GossipConfig {
             delta_bytes_max: 64 * 1024,
             blob_bytes_per_sec: 250_000.0,
             answer_secs: 2.0,
+            condense_entries: 1_000,
             entries_per_frame_max: 100_000,
             epochs_per_robot_max: 64,
         }
@@ -204,6 +207,7 @@ impl Config {
         range("gossip.delta_bytes_max", g.delta_bytes_max as f64, 4096.0, 65536.0, "use 4096 to 65536 bytes")?;
         range("gossip.blob_bytes_per_sec", g.blob_bytes_per_sec, 1e3, 1e9, "use 1000 to 1e9 bytes per second")?;
         range("gossip.answer_secs", g.answer_secs, 0.01, 600.0, "use 0.01 to 600 s")?;
+        range("gossip.condense_entries", f64::from(g.condense_entries), 0.0, 1e7, "use 0 (never) to 10000000")?;
         range("gossip.entries_per_frame_max", f64::from(g.entries_per_frame_max), 1.0, 1e7, "use 1 to 10000000")?;
         range("gossip.epochs_per_robot_max", g.epochs_per_robot_max as f64, 1.0, 1e4, "use 1 to 10000")
     }

@@ -4,6 +4,7 @@
 //! Poses are `{translation: [x, y, z], rotation: [x, y, z, w], scale}`; covariances are the row-major upper triangle of
 //! the local perturbation's covariance in the order (ρ, φ[, λ]): 21 numbers for a rigid pose, 28 for a similarity.
 
+use crate::estimate::optimality::Optimality;
 use crate::geometry::{Relative, Se3, Sim3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -196,6 +197,8 @@ pub struct GraphView {
     pub chi2: f64,
     /// Degrees of freedom.
     pub dof: u64,
+    /// Whether the optimum is proved to be the global one; applies where every measurement's weight is isotropic.
+    pub optimality: Optimality,
     /// Alignments and sightings, used or not (odometry edges are implied by the submaps).
     pub edges: Vec<EdgeView>,
 }

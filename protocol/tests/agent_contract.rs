@@ -326,6 +326,28 @@ fn a_lost_store_begins_a_new_epoch_above_what_peers_remember() {
     assert_eq!(wires.agents[1].digest(), wires.agents[0].digest());
 }
 
+/// Found by the simulator (seed 2679): the second life got back a part of its past, and died before it had written; the
+/// third took that part for a log to go on with, and used a sequence number again.
+#[test]
+fn no_later_run_goes_on_with_a_past_that_came_back_from_peers() {
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    let mut wires =
+        Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 5 }), agent(1, Restored::default())]);
+    for keyframe in &keyframes {
+        wires.input(0, Input::Keyframe(keyframe.clone()));
+    }
+    wires.run(Duration::from_secs(2));
+    wires.agents[0] = agent(0, Restored { records: vec![], fresh_epoch: 9 });
+    wires.disks[0].clear();
+    wires.input(0, Input::Neighbour { robot: robot(1), up: true });
+    wires.run(Duration::from_secs(5));
+    let records = wires.disks[0].clone();
+    let past = records.iter().filter(|record| matches!(record, Record::Entry { id, .. } if id.frame.epoch == 5));
+    assert!(past.count() > 0, "the past came back");
+    let again = agent(0, Restored { records, fresh_epoch: 9 });
+    assert_eq!(again.frame().epoch, 9);
+}
+
 #[test]
 fn the_same_inputs_give_the_same_outputs() {
     let trace = || {

@@ -328,6 +328,8 @@ pub struct FaultCounts {
     pub damage_found: u64,
     /// Stores opened that may have lost an entry.
     pub logs_closed: u64,
+    /// Logs replaced by what still counts of them.
+    pub condensed: u64,
     /// Stores that could not be opened for a while.
     pub store_unusable: u64,
     /// Stores beyond mending, moved away.

@@ -2,7 +2,7 @@
 
 use crate::check::{RobotSample, Sample};
 use merganser_protocol::geometry::{Covariance, Se3, So3};
-use merganser_protocol::snapshot::{PoseView, RelationView};
+use merganser_protocol::snapshot::{FrameView, PoseView, RelationView};
 use nalgebra::{SMatrix, Vector6};
 use serde::Serialize;
 
@@ -23,7 +23,8 @@ pub struct FrameError {
     pub d2: Option<f64>,
 }
 
-/// The errors of all frames that any robot has merged with its own, where the truth is known.
+/// The errors of all frames that any robot has merged with its own, where the truth is known; of a liar's, not those of
+/// its own.
 pub fn frame_errors(sample: &Sample<'_>) -> Vec<FrameError> {
     sample.robots.iter().flat_map(|robot| errors_of(robot, sample)).collect()
 }
@@ -32,7 +33,8 @@ fn errors_of(robot: &RobotSample, sample: &Sample<'_>) -> Vec<FrameError> {
     let Some(snapshot) = &robot.snapshot else { return Vec::new() };
     let own = &snapshot.frames.own;
     let Some(t_world_own) = sample.truth.get(own) else { return Vec::new() };
-    let others = snapshot.frames.frames.iter().filter(|frame| frame.frame != *own);
+    let deceives_itself = |frame: &FrameView| robot.lies && frame.robot == snapshot.status.robot;
+    let others = snapshot.frames.frames.iter().filter(|frame| frame.frame != *own && !deceives_itself(frame));
     others
         .filter_map(|frame| {
             let relation = frame.t_own_frame.as_ref()?;

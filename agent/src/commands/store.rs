@@ -123,7 +123,7 @@ fn verify(config: &Path) -> Result<bool> {
                 forks += 1;
                 proofs.push((*frame, a.clone(), b.clone()));
             }
-            Record::EpochClosed { .. } => {}
+            Record::EpochClosed { .. } | Record::Replaced { .. } => {}
         }
     }
     let count = entries.len();
@@ -190,7 +190,7 @@ fn stats(config: &Path) -> Result<bool> {
             Record::Blob { bytes, .. } => (others.entry("blobs").or_default(), bytes.len()),
             Record::Private { bytes, .. } => (others.entry("private").or_default(), bytes.len()),
             Record::Fork { proof: [a, b], .. } => (others.entry("forks").or_default(), a.len() + b.len()),
-            Record::EpochClosed { .. } => continue,
+            Record::EpochClosed { .. } | Record::Replaced { .. } => continue,
         };
         row.0 += 1;
         row.1 += bytes as u64;

@@ -121,6 +121,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
         },
         map: MapView { submaps: (0..3).flat_map(|r| (0..3).map(move |i| (r, i))).map(|(r, i)| submap(r, i)).collect() },
         graph: GraphView {
+            optimality: Default::default(),
             nodes: 9,
             chi2: 1.0,
             dof: 1,

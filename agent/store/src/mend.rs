@@ -59,7 +59,7 @@ pub struct Report {
     pub damaged_count: usize,
     /// An entry may be missing: this robot begins a new epoch.
     pub entries_lost: bool,
-    /// Why the damage is still in the file, if it is: the disk did not let it be mended.
+    /// Why the damage is still in the file, if it is: the disk did not let it be mended. Until it does, commits fail.
     pub unmended: Option<String>,
 }
 
@@ -96,22 +96,25 @@ pub(crate) fn open(medium: Box<dyn Medium>, owner: Owner, fresh_epoch: u32) -> R
     if report.entries_lost {
         seen.closed_epoch = Some(last_epoch(&seen, &owner));
     }
+    let mut usable = Some(db);
     if !founded && (report.migrated_from.is_some() || report.damaged_count > 0) {
-        drop(catch_unwind(AssertUnwindSafe(|| drop(db))));
+        drop(catch_unwind(AssertUnwindSafe(|| drop(usable.take()))));
         let rebuilt = rebuild(&*medium, &owner, fresh_epoch, &seen, report.damaged_count > 0);
-        db = match rebuilt {
-            Ok(db) => db,
-            // Without room for a second file the old one must do, unless its form is another.
+        usable = match rebuilt {
+            Ok(db) => Some(db),
+            // Without room for a second file there is no writing, as what is damaged may trip the database. Each commit
+            // tries to mend it first.
             Err(error) if report.migrated_from.is_none() => {
                 report.unmended = Some(error.to_string());
-                open_database(&*medium)?
+                None
             }
             Err(error) => return Err(failed(format!("cannot be migrated to schema {SCHEMA}: {error}"))),
         };
     }
     let mut records = seen.records;
     records.extend(seen.closed_epoch.map(|epoch| Record::EpochClosed { epoch }));
-    let store = Store { db: Some(db), medium, owner, distrust: false };
+    let distrust = usable.is_none();
+    let store = Store { db: usable, medium, owner, distrust };
     Ok(Opened { store, restored: Restored { records, fresh_epoch }, report })
 }
 

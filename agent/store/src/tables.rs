@@ -137,6 +137,19 @@ fn put(transaction: &WriteTransaction, record: &Record) -> Result<(), CommitErro
             };
             put_meta(transaction, META_CLOSED_EPOCH, &before.unwrap_or(0).max(*epoch).to_le_bytes())
         }
+        Record::Replaced { below, submaps, blobs } => {
+            let entries = join_key(below.frame, 0)..join_key(below.frame, below.seq);
+            transaction.open_table(ENTRIES)?.retain_in(entries, |_, _| false)?;
+            let mut private = transaction.open_table(PRIVATE)?;
+            for submap in submaps {
+                private.remove(join_key(submap.frame, submap.index))?;
+            }
+            let mut stored = transaction.open_table(BLOBS)?;
+            for blob in blobs {
+                stored.remove(blob.0)?;
+            }
+            Ok(())
+        }
     }
 }
 

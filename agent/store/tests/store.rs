@@ -6,7 +6,7 @@ mod common;
 
 use common::{entry, name, on, open, owner, sorted};
 use merganser_protocol::agent::io::Record;
-use merganser_protocol::ids::{FrameId, Hash, RobotId, SubmapId};
+use merganser_protocol::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use merganser_store::simulated::Disk;
 use merganser_store::{CommitError, FileMedium, Owner, Schema, Store, StoreError, inspect};
 use redb::{Database, ReadableDatabase, TableDefinition};
@@ -54,6 +54,31 @@ fn an_entry_is_never_replaced_by_another() {
     store.commit([entry(1, b"other")].iter()).unwrap();
     drop(store);
     assert_eq!(sorted(on(&disk).restored.records), sorted(vec![entry(0, b"first"), entry(1, b"other")]));
+}
+
+#[test]
+fn what_was_replaced_goes_in_the_commit_that_replaces_it() {
+    let disk = Disk::default();
+    let mut store = on(&disk).store;
+    let frame = |epoch| FrameId { robot: RobotId([3; 8]), epoch };
+    let at =
+        |epoch, seq, bytes: &[u8]| Record::Entry { id: EntryId { frame: frame(epoch), seq }, bytes: bytes.to_vec() };
+    let submap = |index| SubmapId { frame: frame(9), index };
+    let private = |index| Record::Private { submap: submap(index), bytes: vec![1; 10] };
+    let blob = |bytes: &[u8]| Record::Blob { hash: Hash::of(bytes), bytes: bytes.to_vec() };
+    let before = [at(8, 0, b"earlier epoch"), at(9, 0, b"zero"), at(9, 1, b"one"), at(10, 0, b"later epoch")];
+    store.commit(before.iter().chain(&[private(0), private(1), blob(b"gone"), blob(b"stays")])).unwrap();
+    let replaced = Record::Replaced {
+        below: EntryId { frame: frame(9), seq: 2 },
+        submaps: vec![submap(1), submap(77)],
+        blobs: vec![Hash::of(b"gone"), Hash::of(b"never was")],
+    };
+    store.commit([at(9, 2, b"floor"), replaced].iter()).unwrap();
+    drop(store);
+    let left = vec![before[0].clone(), at(9, 2, b"floor"), before[3].clone(), private(0), blob(b"stays")];
+    let again = on(&disk);
+    assert_eq!(sorted(again.restored.records), sorted(left));
+    assert_eq!(again.report, merganser_store::Report::default());
 }
 
 #[test]

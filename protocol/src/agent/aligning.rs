@@ -32,6 +32,12 @@ impl Agent {
             Fact::Submap(fact) => self.note_candidates(SubmapId { frame: id.frame, index: fact.index }),
             Fact::Alignment(fact) => self.note_verification(id, fact),
             Fact::Verdict(fact) => self.report_agreement(fact.alignment),
+            // What is carried on called for something when it was new; to whom it is new, it calls now.
+            Fact::Condensed(condensed) => {
+                for one in condensed.carried.iter().filter(|one| !matches!(one.fact, Fact::Verdict(_))) {
+                    self.on_fact(EntryId { seq: one.seq, ..id }, &one.fact);
+                }
+            }
             Fact::Sighting(_) => {}
         }
     }

@@ -213,6 +213,15 @@ pub enum Record {
         /// The last one closed.
         epoch: u32,
     },
+    /// What a log's writer has replaced, to be taken off the disk in the same commit.
+    Replaced {
+        /// The entries of its log below this one.
+        below: EntryId,
+        /// Own submaps that are gone: what is private to them.
+        submaps: Vec<SubmapId>,
+        /// Keypoint blobs that no submap of ours names any more.
+        blobs: Vec<Hash>,
+    },
 }
 
 /// Something people may want to know. Shells log it; tests assert on it.
@@ -277,6 +286,17 @@ pub enum Event {
     },
     /// Storage works again; nothing was lost.
     StoreHealed,
+    /// Our log was replaced by what still counts of it.
+    Condensed {
+        /// Which.
+        frame: FrameId,
+        /// Entries that hold it now.
+        parts: usize,
+        /// Submaps that are gone: nothing was tied to them.
+        submaps_gone: usize,
+        /// Bytes of the entries before and after.
+        bytes: [usize; 2],
+    },
     /// A new epoch, hence a new frame, began.
     EpochBegan {
         /// Its frame.

@@ -3,10 +3,11 @@
 
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, SubmapConfig};
-use crate::estimate::joint::{EdgeEstimate, MapProblem, PairEstimate, solve_map};
+use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, solve_map};
+use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
-use crate::submap::{self, Described, Features, Keypoints, RefineConfig, Submap};
+use crate::submap::{self, Described, Features, Keypoints, RegisterConfig, RegisterError, Submap};
 use crate::wire::fact::{RefusalReason, ScaleKind};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -87,6 +88,25 @@ pub struct Solved {
     pub dof: usize,
     /// Anchors.
     pub nodes: usize,
+    /// Whether it is proved to be the global optimum.
+    pub optimality: Optimality,
+}
+
+impl Solved {
+    /// The submaps by their indices, where the problem counted places in a chain that has gaps.
+    pub(super) fn with_indices(mut self, gaps: &BTreeMap<FrameId, Vec<u32>>) -> Self {
+        let index = |id: SubmapId| {
+            let there = gaps.get(&id.frame).and_then(|chain| chain.get(id.index as usize));
+            there.map_or(id, |index| SubmapId { index: *index, ..id })
+        };
+        if !gaps.is_empty() {
+            self.anchors = self.anchors.into_iter().map(|(id, t)| (index(id), t)).collect();
+            for AgreedAlignment { i, j, .. } in self.edges.iter_mut().map(|edge| &mut edge.measurement) {
+                (*i, *j) = (index(*i), index(*j));
+            }
+        }
+        self
+    }
 }
 
 /// Where a frame is.
@@ -149,13 +169,39 @@ impl SolveJob {
             chi2: estimate.chi2,
             dof: estimate.dof,
             nodes: estimate.nodes,
+            optimality: estimate.optimality(),
         }
     }
 }
 
 impl AlignJob {
-    /// Matches, finds a consensus, checks the fit, refines (MATH §4; PERCEPTION).
+    /// Where units are metres, clouds judge the poses that matches suggest; else the matches alone decide.
     fn run(&self) -> Result<Measured, RefusalReason> {
+        match self.scale {
+            ScaleKind::Metric => self.register(),
+            ScaleKind::Unknown => self.align(),
+        }
+    }
+
+    fn register(&self) -> Result<Measured, RefusalReason> {
+        let config =
+            RegisterConfig { solver: self.solver(), fit_min: self.config.fit_min, ..RegisterConfig::default() };
+        let found = submap::register(&self.theirs, &self.mine, &config).map_err(|error| match error {
+            RegisterError::NoConsensus { .. } => RefusalReason::NoConsensus,
+            RegisterError::Ambiguous { .. } => RefusalReason::Ambiguous,
+            RegisterError::Refine(_) => RefusalReason::Degenerate,
+            RegisterError::Solver(_) => RefusalReason::BadInput,
+        })?;
+        Ok(Measured {
+            t_mine_theirs: Relative::Metric(found.refined.pose),
+            sigma: found.refined.rms,
+            support: found.support,
+            log10_nfa: found.log10_nfa,
+        })
+    }
+
+    /// Matches, finds a consensus, checks the fit (MATH §4).
+    fn align(&self) -> Result<Measured, RefusalReason> {
         let matches = submap::match_keypoints(&self.theirs, &self.mine);
         let problem = Problem {
             source: &matches.source,
@@ -171,13 +217,7 @@ impl AlignJob {
         if fit < self.config.fit_min {
             return Err(RefusalReason::PoorFit);
         }
-        let t_mine_theirs = match &found.t_target_source {
-            Relative::Metric(p) => {
-                let refined = submap::refine(&self.theirs, &self.mine, &p.pose, &RefineConfig::default());
-                Relative::Metric(refined.map_err(|_| RefusalReason::Degenerate)?.pose)
-            }
-            similarity @ Relative::Similarity(_) => *similarity,
-        };
+        let t_mine_theirs = found.t_target_source;
         let (sigma, support, log10_nfa) = (found.sigma, found.support, found.log10_nfa);
         Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
     }

@@ -7,7 +7,9 @@ use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, SimWithCova
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::Summary;
 use crate::time::Stamp;
-use crate::wire::fact::{AlignmentFact, Fact, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome};
+use crate::wire::fact::{
+    AlignmentFact, CarriedFact, Fact, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
+};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// χ² 99.9 % quantiles for 6 and 7 degrees of freedom: two independent alignments of one pair agree below these.
@@ -39,6 +41,10 @@ pub enum Agreement {
 pub struct Known {
     /// The entry that states it.
     pub entry: EntryId,
+    /// Place of the entry that holds the fact now: another, if it is carried on.
+    pub held_at: u32,
+    /// Index of the submap that `t_prev_this` begins at; `None` for the origin of the frame.
+    pub after: Option<u32>,
     /// Stamps of the first and last keyframe.
     pub stamps: [Stamp; 2],
     /// `t_prev_this`.
@@ -60,7 +66,13 @@ pub struct Question {
     pub problem: MapProblem,
     /// Frames that nothing ties to anything, and how many anchors each has: their odometry is all there is to say.
     pub alone: BTreeMap<FrameId, usize>,
+    /// The problem counts the anchors of a frame from 0. These are the indices of those frames of it whose submaps are
+    /// no longer all there.
+    pub gaps: Gaps,
 }
+
+/// Indices of the submaps of frames that have lost some, by their places in the chain.
+pub type Gaps = BTreeMap<FrameId, Vec<u32>>;
 
 /// All facts held, parsed and indexed.
 #[derive(Clone, Debug, Default)]
@@ -80,7 +92,17 @@ impl Knowledge {
     /// ignored: they are signed, so they stay in the log as evidence, but they move nothing.
     pub fn absorb(&mut self, id: EntryId, fact: Fact) {
         match fact {
-            Fact::Submap(submap) => self.absorb_submap(id, &submap),
+            Fact::Submap(submap) => self.absorb_submap(id, id.seq, submap.index.checked_sub(1), &submap),
+            Fact::Condensed(condensed) => {
+                for CarriedFact { seq, after, fact } in condensed.carried {
+                    let stated = EntryId { seq, ..id };
+                    match fact {
+                        _ if seq >= id.seq => {}
+                        Fact::Submap(submap) => self.absorb_submap(stated, id.seq, after, &submap),
+                        fact => self.absorb(stated, fact),
+                    }
+                }
+            }
             Fact::Alignment(alignment) => self.absorb_alignment(id, alignment),
             Fact::Verdict(verdict) => {
                 let alignment = verdict.alignment;
@@ -96,12 +118,41 @@ impl Knowledge {
         }
     }
 
+    /// Forgets what a writer's entries below its floor said: what still counts of it is carried on above.
+    pub fn forget_below(&mut self, frame: FrameId, floor: u32) {
+        let gone = |id: &EntryId| id.frame == frame && id.seq < floor;
+        self.submaps.retain(|_, known| !gone(&known.entry));
+        self.sightings.retain(|id, _| !gone(id));
+        let entries = EntryId { frame, seq: 0 }..EntryId { frame, seq: floor };
+        let alignments: Vec<EntryId> = self.alignments.range(entries).map(|(id, _)| *id).collect();
+        for id in alignments {
+            let Some(fact) = self.alignments.remove(&id) else { continue };
+            self.agreements.remove(&id);
+            if let Some(ids) = self.by_pair.get_mut(&(fact.i, fact.j)) {
+                ids.remove(&id);
+            }
+        }
+        self.by_pair.retain(|_, ids| !ids.is_empty());
+        let mut answered = Vec::new();
+        for (alignment, verdicts) in &mut self.verdicts {
+            let before = verdicts.len();
+            verdicts.retain(|id, _| !gone(id));
+            answered.extend((verdicts.len() < before).then_some(*alignment));
+        }
+        self.verdicts.retain(|_, verdicts| !verdicts.is_empty());
+        for alignment in answered {
+            self.agreements.insert(alignment, self.judge(alignment));
+        }
+    }
+
     /// Of two submaps that claim one index, the one written first counts, in whatever order they arrive.
-    fn absorb_submap(&mut self, entry: EntryId, fact: &SubmapFact) {
+    fn absorb_submap(&mut self, entry: EntryId, held_at: u32, after: Option<u32>, fact: &SubmapFact) {
         let submap = SubmapId { frame: entry.frame, index: fact.index };
         if self.submaps.get(&submap).is_none_or(|first| entry < first.entry) {
             let known = Known {
                 entry,
+                held_at,
+                after,
                 stamps: fact.stamps,
                 t_prev_this: fact.odometry.pose,
                 extent: fact.extent,
@@ -207,46 +258,65 @@ impl Knowledge {
     }
 
     /// The estimation problem: one agreed alignment per pair, all sightings, and the unbroken chain of submaps of every
-    /// frame they tie, and of `own`. `odometry` reads `t_prev_this` from a submap's entry.
-    pub fn question(&self, own: FrameId, odometry: impl Fn(EntryId) -> Option<PoseWithCovariance>) -> Question {
-        let mut alone: BTreeMap<FrameId, usize> = BTreeMap::new();
-        for id in self.submaps.keys() {
-            let len = alone.entry(id.frame).or_default();
-            *len += usize::from(*len == id.index as usize);
-        }
-        alone.retain(|_, len| *len > 0);
-        let held = |id: SubmapId| alone.get(&id.frame).is_some_and(|len| (id.index as usize) < *len);
+    /// frame they tie, and of `own`. `odometry` reads `t_prev_this` from where a submap's fact is held.
+    pub fn question(&self, own: FrameId, odometry: impl Fn(&Known) -> Option<PoseWithCovariance>) -> Question {
+        let chains = self.chains();
+        let place = |id: SubmapId| {
+            let index = chains.get(&id.frame)?.binary_search(&id.index).ok()?;
+            Some(SubmapId { index: index as u32, ..id })
+        };
+        let tie = |entry: EntryId, i: SubmapId, j: SubmapId, t_i_j: Relative| {
+            Some(AgreedAlignment { entry, i: place(i)?, j: place(j)?, t_i_j })
+        };
         let mut alignments: Vec<AgreedAlignment> = self
             .by_pair
             .iter()
-            .filter(|((i, j), _)| held(*i) && held(*j))
+            .filter(|((i, j), _)| place(*i).is_some() && place(*j).is_some())
             .filter_map(|(_, ids)| ids.iter().find(|id| self.agreement(**id) == Agreement::Agreed))
             .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
-            .map(|(entry, fact)| AgreedAlignment { entry, i: fact.i, j: fact.j, t_i_j: self.measurement(entry, fact) })
+            .filter_map(|(entry, fact)| tie(entry, fact.i, fact.j, self.measurement(entry, fact)))
             .collect();
         distortion::charge(&mut alignments);
-        let sightings: Vec<AgreedAlignment> = self
-            .sightings
-            .iter()
-            .filter(|(_, fact)| held(fact.i) && held(fact.j))
-            .map(|(entry, fact)| AgreedAlignment {
-                entry: *entry,
-                i: fact.i,
-                j: fact.j,
-                t_i_j: Relative::Metric(fact.t_i_j),
-            })
-            .collect();
+        let sightings = self.sightings.iter();
+        let sightings: Vec<AgreedAlignment> =
+            sightings.filter_map(|(entry, fact)| tie(*entry, fact.i, fact.j, Relative::Metric(fact.t_i_j))).collect();
         let ties = alignments.iter().chain(&sightings);
         let tied: BTreeSet<FrameId> = ties.flat_map(|tie| [tie.i.frame, tie.j.frame]).chain([own]).collect();
-        let chain = |frame: FrameId| {
-            let len = alone.remove(&frame)?;
-            let anchor = |index| SubmapId { frame, index };
-            let known = self.submaps.range(anchor(0)..anchor(len as u32)).map(|(_, known)| known);
-            let odometry = known.clone().map_while(|known| odometry(known.entry)).collect();
-            Some((frame, FrameChain { scale: known.clone().next()?.scale, odometry }))
+        let chain = |frame: &FrameId| {
+            let known = |index: &u32| self.submap(SubmapId { frame: *frame, index: *index });
+            let mut anchors = chains.get(frame)?.iter().filter_map(known).peekable();
+            let scale = anchors.peek()?.scale;
+            Some((*frame, FrameChain { scale, odometry: anchors.map_while(&odometry).collect() }))
         };
-        let frames = tied.into_iter().filter_map(chain).collect();
-        Question { problem: MapProblem { frames, alignments, sightings }, alone }
+        let frames = tied.iter().filter_map(chain).collect();
+        let (posed, alone): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            chains.into_iter().partition(|(frame, _)| tied.contains(frame));
+        let gaps =
+            posed.into_iter().filter(|(_, chain)| chain.last().is_some_and(|last| *last as usize >= chain.len()));
+        Question {
+            problem: MapProblem { frames, alignments, sightings },
+            alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
+            gaps: gaps.collect(),
+        }
+    }
+
+    /// Submaps that an alignment or a sighting names.
+    pub fn tied_submaps(&self) -> BTreeSet<SubmapId> {
+        let aligned = self.alignments.values().flat_map(|fact| [fact.i, fact.j]);
+        aligned.chain(self.sightings.values().flat_map(|fact| [fact.i, fact.j])).collect()
+    }
+
+    /// The indices of every frame's submaps from the origin on, as far as each step between them is known.
+    pub fn chains(&self) -> BTreeMap<FrameId, Vec<u32>> {
+        let mut chains: BTreeMap<FrameId, (Vec<u32>, bool)> = BTreeMap::new();
+        for (id, known) in &self.submaps {
+            let (chain, whole) = chains.entry(id.frame).or_insert_with(|| (Vec::new(), true));
+            *whole &= known.after == chain.last().copied();
+            if *whole {
+                chain.push(id.index);
+            }
+        }
+        chains.into_iter().filter(|(_, (chain, _))| !chain.is_empty()).map(|(f, (chain, _))| (f, chain)).collect()
     }
 }
 

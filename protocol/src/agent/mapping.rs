@@ -111,12 +111,11 @@ impl Agent {
     pub(super) fn resume_mapping(&mut self) {
         let mut t_frame_anchor = None;
         let mut next_index = 0;
-        for (id, fact) in self.knowledge.submaps().filter(|(id, _)| id.frame == self.me.frame) {
-            if id.index != next_index {
-                break;
-            }
-            next_index += 1;
-            t_frame_anchor = Some(t_frame_anchor.unwrap_or_else(Se3::identity) * fact.t_prev_this);
+        let chain = self.knowledge.chains().remove(&self.me.frame).unwrap_or_default();
+        for index in chain {
+            let Some(known) = self.knowledge.submap(SubmapId { frame: self.me.frame, index }) else { break };
+            next_index = index + 1;
+            t_frame_anchor = Some(t_frame_anchor.unwrap_or_else(Se3::identity) * known.t_prev_this);
         }
         self.mapper.builder = SubmapBuilder::resume(self.config.submap.clone(), next_index, t_frame_anchor);
     }

@@ -7,6 +7,9 @@
 //! published, counted in the have-vector, used in the estimate) when [`Input::Persisted`] confirms it.
 
 mod aligning;
+mod condensing;
+#[cfg(test)]
+mod condensing_tests;
 mod distortion;
 mod gossip;
 pub mod io;
@@ -25,6 +28,7 @@ use crate::replica::{AppendError, IngestError, Ingested, Replica, RosterError};
 use crate::time::Instant;
 use crate::wire::EntryBytes;
 use crate::wire::fact::Fact;
+use condensing::Condensing;
 use ed25519_dalek::SigningKey;
 use gossip::Gossip;
 use io::{Command, Event, Input, JobId, Output, QueryId, Record};
@@ -39,6 +43,7 @@ use stats::Stats;
 use std::collections::{BTreeMap, VecDeque};
 use thiserror::Error;
 
+pub use condensing::GONE_IN_A_ROW_MAX;
 pub use knowledge::Agreement;
 pub use negotiation::{ALIGNMENTS_PER_FRAME_PAIR, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP};
 
@@ -101,6 +106,7 @@ pub struct Agent {
     gossip: Gossip,
     map: MapState,
     stats: Stats,
+    condensing: Condensing,
     receive_only: bool,
     next_job: u64,
     next_query: u64,
@@ -159,6 +165,7 @@ impl Agent {
             negotiation: Negotiation::default(),
             map: MapState::default(),
             stats: Stats::default(),
+            condensing: Condensing::default(),
             receive_only: false,
             next_job: 1,
             next_query: 1,
@@ -188,6 +195,7 @@ impl Agent {
         self.start_describing();
         self.start_aligning();
         self.start_solving();
+        self.condense();
         self.close_batch();
     }
 
@@ -236,6 +244,8 @@ impl Agent {
                 Record::Private { submap, bytes } => private.push((submap, bytes)),
                 Record::Fork { proof, .. } => forks.push(proof),
                 Record::EpochClosed { epoch } => closed = closed.max(Some(epoch)),
+                // A store gives back what is there.
+                Record::Replaced { .. } => {}
             }
         }
         let loaded = self.replica.restore(entries);
@@ -282,6 +292,9 @@ impl Agent {
                 for id in ids {
                     let Some(bytes) = self.replica.entry_bytes(id) else { continue };
                     self.ledger.open.push(Record::Entry { id, bytes: bytes.to_vec() });
+                    if self.replica.is_floor(id) {
+                        self.ledger.open.push(Record::Replaced { below: id, submaps: vec![], blobs: vec![] });
+                    }
                     self.meet_own_past(id);
                 }
                 return true;
@@ -321,10 +334,17 @@ impl Agent {
         self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
     }
 
-    /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide.
+    /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide, and
+    /// no later run may take this log for one to go on with: what we hold of it may be less than others do.
     fn meet_own_past(&mut self, id: EntryId) {
-        if id.frame.robot == self.me.robot && id.frame.epoch >= self.me.frame.epoch {
-            self.begin_epoch(id.frame.epoch.saturating_add(1));
+        let FrameId { robot, epoch } = id.frame;
+        if robot != self.me.robot {
+            return;
+        }
+        if epoch >= self.me.frame.epoch {
+            self.begin_epoch(epoch.saturating_add(1));
+        } else {
+            self.ledger.open.push(Record::EpochClosed { epoch });
         }
     }
 
@@ -383,6 +403,10 @@ impl Agent {
         let Some(entry) = self.replica.entry(id).filter(|entry| !self.replica.is_quarantined(entry.id().frame)) else {
             return;
         };
+        if self.replica.is_floor(id) {
+            self.knowledge.forget_below(id.frame, id.seq);
+            self.negotiation.drop_unknown(&self.knowledge);
+        }
         match entry.fact() {
             Ok(fact) => {
                 self.knowledge.absorb(id, fact.clone());
@@ -401,7 +425,7 @@ impl Agent {
         // but news, and these are old.
         let mut calling = Vec::new();
         for (id, fact) in self.replica.facts() {
-            if matches!(fact, Fact::Alignment(_) | Fact::Sighting(_)) {
+            if matches!(fact, Fact::Alignment(_) | Fact::Sighting(_) | Fact::Condensed(_)) {
                 calling.push((id, fact.clone()));
             }
             self.knowledge.absorb(id, fact);

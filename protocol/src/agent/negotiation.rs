@@ -6,7 +6,7 @@
 //! dormant. Every pair is tried once; every foreign alignment that names us is verified once.
 
 use super::io::{JobId, QueryId};
-use super::knowledge::{Pair, pair_of};
+use super::knowledge::{Knowledge, Pair, pair_of};
 use super::shortlist::{Candidate, Shortlist};
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::{Features, Keypoints};
@@ -130,6 +130,18 @@ impl Negotiation {
         while self.features.len() > FEATURES_MAX {
             self.features.pop_first();
         }
+    }
+
+    /// An own submap is gone.
+    pub fn forget(&mut self, submap: SubmapId) {
+        self.features.remove(&submap);
+    }
+
+    /// Candidates and wishes that name a submap which is gone go as well.
+    pub fn drop_unknown(&mut self, knowledge: &Knowledge) {
+        let known = |candidate: &Candidate| knowledge.submap(candidate.theirs).is_some();
+        self.candidates.retain(known);
+        self.wishes.retain(known);
     }
 
     /// The features of an own submap.

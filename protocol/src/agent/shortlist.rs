@@ -47,6 +47,12 @@ impl Shortlist {
         Some(candidate)
     }
 
+    /// Takes off the list what is not to stay.
+    pub fn retain(&mut self, stays: impl Fn(&Candidate) -> bool) {
+        self.pairs.retain(|_, candidate| stays(candidate));
+        self.ranks.retain(|(_, pair)| self.pairs.contains_key(pair));
+    }
+
     /// Notes that the other endpoint asked for a pair. False if it is not on the list.
     pub fn wish(&mut self, pair: Pair) -> bool {
         self.pairs.get_mut(&pair).map(|candidate| candidate.wished = true).is_some()

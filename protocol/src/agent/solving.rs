@@ -3,11 +3,11 @@
 use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{Job, SolveJob, Solved};
-use super::knowledge::Question;
+use super::knowledge::{Gaps, Known, Question};
 use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{EntryId, FrameId, Hash, SubmapId};
 use crate::time::Instant;
-use crate::wire::fact::Fact;
+use crate::wire::fact::{Fact, SubmapFact};
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -25,6 +25,7 @@ pub(super) struct MapState {
     posed_digest: Hash,
     posed_from: Option<FrameId>,
     posed_alone: BTreeMap<FrameId, usize>,
+    posed_gaps: Gaps,
     /// Digest of the set of facts that the estimate is a function of.
     pub(super) digest: Hash,
     next_solve: Instant,
@@ -40,9 +41,9 @@ impl Agent {
         if self.map.dirty && self.map.solving.is_none() && self.now >= self.map.next_solve {
             let config = self.config.estimate.clone();
             let own = self.me.frame;
-            let Question { problem, alone } = self.knowledge.question(own, |entry| self.odometry(entry));
+            let Question { problem, alone, gaps } = self.knowledge.question(own, |known| self.odometry(known));
             let job = SolveJob { problem, config, own };
-            (self.map.posed_from, self.map.posed_alone) = (Some(own), alone);
+            (self.map.posed_from, self.map.posed_alone, self.map.posed_gaps) = (Some(own), alone, gaps);
             self.map.dirty = false;
             self.map.posed_digest = self.replica.digest();
             self.map.next_solve = self.now.after(Duration::from_secs_f64(self.config.estimate.interval_secs));
@@ -57,7 +58,7 @@ impl Agent {
         self.map.digest = self.map.posed_digest;
         self.map.seen_from = self.map.posed_from;
         self.map.alone = core::mem::take(&mut self.map.posed_alone);
-        self.map.solved = solved;
+        self.map.solved = solved.with_indices(&core::mem::take(&mut self.map.posed_gaps));
         let merged = self.frames_merged_with_ours();
         self.negotiation.stir();
         let before = core::mem::replace(&mut self.map.merged, merged.clone());
@@ -91,9 +92,20 @@ impl Agent {
         (self.map.seen_from == Some(self.me.frame)).then_some(&self.map.solved)
     }
 
-    fn odometry(&self, entry: EntryId) -> Option<PoseWithCovariance> {
-        match self.replica.entry(entry)?.fact().ok()? {
-            Fact::Submap(fact) => Some(fact.odometry),
+    /// `t_prev_this` of a submap, from the entry that holds it now.
+    pub(super) fn odometry(&self, known: &Known) -> Option<PoseWithCovariance> {
+        self.submap_fact(known).map(|fact| fact.odometry)
+    }
+
+    /// A submap's fact, from the entry that holds it now.
+    pub(super) fn submap_fact(&self, known: &Known) -> Option<SubmapFact> {
+        let held_at = EntryId { seq: known.held_at, ..known.entry };
+        match self.replica.entry(held_at)?.fact().ok()? {
+            Fact::Submap(fact) => Some(fact),
+            Fact::Condensed(condensed) => {
+                let carried = condensed.carried.into_iter().find(|one| one.seq == known.entry.seq)?;
+                if let Fact::Submap(fact) = carried.fact { Some(fact) } else { None }
+            }
             _ => None,
         }
     }

@@ -41,7 +41,7 @@ impl Agent {
             id: self.me.robot.to_string(),
             epoch: self.me.frame.epoch,
             neighbours: self.gossip.spread.neighbours().map(|robot| self.robot_name(robot)).collect(),
-            entries: self.replica.count(),
+            entries: self.replica.held(),
             digest: self.replica.digest().to_string(),
             submaps: self.negotiation.own().count() as u64,
             keyframes: self.mapper.keyframes,
@@ -198,7 +198,13 @@ impl Agent {
         }
         edges.extend(self.unused_edges(&listed));
         let nodes = solved.nodes + self.map.alone.values().sum::<usize>();
-        GraphView { nodes: nodes as u64, chi2: solved.chi2, dof: solved.dof as u64, edges }
+        GraphView {
+            nodes: nodes as u64,
+            chi2: solved.chi2,
+            dof: solved.dof as u64,
+            optimality: solved.optimality,
+            edges,
+        }
     }
 
     /// Alignments that did not enter the estimate, with the reason.

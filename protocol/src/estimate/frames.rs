@@ -14,7 +14,7 @@
 //! rightly in 99.1 to 99.8 %, 4 against 4 are ambiguous in 99.9 to 100 %. The NFA alone, without evidence, reaches 97 and
 //! merges 0.3 % of the former wrongly; the prototype of MATH §5, over 400 worlds, 97.8 and 2.3 %.
 
-mod clique;
+pub(super) mod clique;
 mod decide;
 mod doubt;
 mod evidence;
@@ -35,6 +35,7 @@ use super::trajectory::Trajectory;
 use crate::config::EstimateConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
 use measured::Measured;
+pub(super) use measured::scales_to;
 pub(super) use promising::promising;
 pub use scaled::SimMeasurement;
 

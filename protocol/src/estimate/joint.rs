@@ -11,6 +11,7 @@
 use super::graph::{Factor, Graph, Label};
 use super::intake::{Intake, Kind};
 use super::marginals::certain;
+use super::optimality::Optimality;
 use super::pairs::{self, Pair};
 use super::reweight::{self, Drop};
 use super::solve::{Solution, SolveError, solve};
@@ -312,6 +313,13 @@ impl JointEstimate {
         };
         out.pairs = pairs.into_iter().map(|pair| pair.estimate(&out)).collect();
         out
+    }
+
+    /// What can be proved about the whole: the least that can be of any component.
+    pub fn optimality(&self) -> Optimality {
+        let known = |c: &Component| c.solution.as_ref().map_or(Optimality::NotCertified, Solution::optimality);
+        let of_all = self.components.iter().map(known).collect::<BTreeSet<_>>();
+        of_all.into_iter().next_back().unwrap_or_default()
     }
 
     /// The component of a frame; frames with the same number are connected. `None` for a frame without anchors.

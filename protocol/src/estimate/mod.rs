@@ -10,6 +10,7 @@ pub mod joint;
 mod loops;
 pub mod marginals;
 mod minimise;
+pub mod optimality;
 mod pairs;
 pub mod posegraph;
 pub mod residual;
@@ -30,6 +31,6 @@ mod joint_tests;
 #[cfg(test)]
 mod solve_tests;
 #[cfg(test)]
-mod test_graphs;
+pub(crate) mod test_graphs;
 #[cfg(test)]
-mod test_world;
+pub(crate) mod test_world;

@@ -10,6 +10,7 @@ use super::solve::Solution;
 use super::sparse::SelectedInverse;
 use crate::geometry::sim3::{self, Matrix7, Vector7};
 use crate::geometry::{Relative, se3};
+use libm::log;
 use nalgebra::SMatrix;
 
 /// χ² quantiles at 99.9 %, 1 to 7 degrees of freedom.
@@ -46,7 +47,7 @@ pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
     let inverse = solution.selected_inverse();
     let tested = solution.graph().edges().iter().filter(|e| e.factor.label != Label::Odometry);
     let failing = tested.filter_map(|edge| {
-        let (chi2, dof) = leave_one_out(solution, &inverse, edge)?;
+        let LeftOut { chi2, dof, .. } = leave_one_out(solution, &inverse, edge)?;
         let limit = CHI2_999.get(dof.checked_sub(1)?)?;
         (chi2 > *limit).then_some((chi2 / limit, Drop { label: edge.factor.label, chi2 }))
     });
@@ -58,8 +59,19 @@ pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
     failing.into_iter().map(|(_, drop)| drop).collect()
 }
 
-/// The leave-one-out χ² of a measurement and the number of redundant directions.
-pub(super) fn leave_one_out(solution: &Solution, inverse: &SelectedInverse<'_>, edge: &Edge) -> Option<(f64, usize)> {
+/// A measurement against the map without it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct LeftOut {
+    /// The leave-one-out χ².
+    pub(super) chi2: f64,
+    /// Number of redundant directions.
+    pub(super) dof: usize,
+    /// ln √det of the innovation's covariance in these directions.
+    pub(super) log_sqrt_det: f64,
+}
+
+/// The leave-one-out χ² of a measurement.
+pub(super) fn leave_one_out(solution: &Solution, inverse: &SelectedInverse<'_>, edge: &Edge) -> Option<LeftOut> {
     let residual = edge.residual(solution.values());
     let predicted = solution.covariance_along(inverse, edge.i, edge.j)?;
     match &edge.factor.t_i_j {
@@ -81,8 +93,9 @@ fn deletion<const N: usize>(
     r: &SMatrix<f64, N, 1>,
     measurement: &SMatrix<f64, N, N>,
     predicted: &SMatrix<f64, N, N>,
-) -> Option<(f64, usize)> {
+) -> Option<LeftOut> {
     let l = measurement.cholesky()?.l();
+    let mut log_sqrt_det: f64 = l.diagonal().iter().map(|&x| log(x)).sum();
     let r = l.solve_lower_triangular(r)?;
     let half = l.solve_lower_triangular(predicted)?;
     let predicted = l.solve_lower_triangular(&half.transpose())?;
@@ -95,9 +108,10 @@ fn deletion<const N: usize>(
             let along: f64 = eigen.eigenvectors.column(k).iter().zip(r.iter()).map(|(v, x)| v * x).sum();
             chi2 += along * along / share;
             dof += 1;
+            log_sqrt_det -= 0.5 * log(share);
         }
     }
-    Some((chi2, dof))
+    Some(LeftOut { chi2, dof, log_sqrt_det })
 }
 
 #[cfg(test)]
@@ -120,8 +134,10 @@ mod tests {
     fn a_source_without_redundancy_is_not_tested() {
         let sigma = SMatrix::<f64, 6, 6>::identity();
         let r = SMatrix::<f64, 6, 1>::repeat(1e-9);
-        assert_eq!(deletion(&r, &sigma, &sigma), Some((0.0, 0)));
-        let (chi2, dof) = deletion(&SMatrix::<f64, 6, 1>::repeat(1.0), &sigma, &(sigma * 0.5)).unwrap();
-        assert!(dof == 6 && (chi2 - 12.0).abs() < 1e-12);
+        assert_eq!(deletion(&r, &sigma, &sigma), Some(LeftOut { chi2: 0.0, dof: 0, log_sqrt_det: 0.0 }));
+        let out = deletion(&SMatrix::<f64, 6, 1>::repeat(1.0), &sigma, &(sigma * 0.5)).unwrap();
+        assert!(out.dof == 6 && (out.chi2 - 12.0).abs() < 1e-12);
+        // The innovation's covariance is twice the measurement's.
+        assert!((out.log_sqrt_det - 3.0 * log(2.0)).abs() < 1e-12);
     }
 }

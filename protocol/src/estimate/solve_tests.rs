@@ -1,7 +1,7 @@
 //! The solver against truth, its own covariances, published optima, and hostile input.
 
 use super::graph::{Factor, Graph, GraphError, Label};
-use super::reweight::leave_one_out;
+use super::reweight::{LeftOut, leave_one_out};
 use super::solve::{Solution, SolveError, solve};
 use super::test_graphs::*;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
@@ -329,6 +329,6 @@ fn leave_one_out_equals_the_innovation_against_the_map_without_the_factor() {
     let predicted = without.relative(tested.i, tested.j, &BTreeSet::new()).unwrap();
     let want = predicted.disagreement(&tested.t_i_j).distance_squared;
     let edge = with.graph().edges().iter().find(|e| e.factor.label == tested.label).unwrap();
-    let (got, dof) = leave_one_out(&with, &with.selected_inverse(), edge).unwrap();
+    let LeftOut { chi2: got, dof, .. } = leave_one_out(&with, &with.selected_inverse(), edge).unwrap();
     assert!(dof == 6 && (got / want - 1.0).abs() < 0.02, "{got} {want}");
 }

@@ -10,26 +10,26 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
 
-pub(super) const ODOMETRY: (f64, f64) = (0.03, 0.008);
-pub(super) const ALIGNMENT: (f64, f64) = (0.04, 0.01);
+pub(crate) const ODOMETRY: (f64, f64) = (0.03, 0.008);
+pub(crate) const ALIGNMENT: (f64, f64) = (0.04, 0.01);
 
 /// Robots that drive through one place: the truth, and what they would state.
-pub(super) struct World {
+pub(crate) struct World {
     /// `t_world_anchor`, in metres.
-    pub(super) truth: BTreeMap<SubmapId, Se3>,
+    pub(crate) truth: BTreeMap<SubmapId, Se3>,
     /// `t_world_frame`; its scale is metres per unit of the frame.
-    pub(super) frames: BTreeMap<FrameId, Sim3>,
-    pub(super) problem: MapProblem,
-    pub(super) next: u32,
+    pub(crate) frames: BTreeMap<FrameId, Sim3>,
+    pub(crate) problem: MapProblem,
+    pub(crate) next: u32,
 }
 
 impl World {
-    pub(super) fn new(rng: &mut ChaCha8Rng, robots: u8, anchors: usize, exact: bool) -> Self {
+    pub(crate) fn new(rng: &mut ChaCha8Rng, robots: u8, anchors: usize, exact: bool) -> Self {
         Self::scaled(rng, &vec![None; usize::from(robots)], anchors, exact)
     }
 
     /// A frame of unknown unit for each `Some(metres per unit)`.
-    pub(super) fn scaled(rng: &mut ChaCha8Rng, scales: &[Option<f64>], anchors: usize, exact: bool) -> Self {
+    pub(crate) fn scaled(rng: &mut ChaCha8Rng, scales: &[Option<f64>], anchors: usize, exact: bool) -> Self {
         let (truth, frames, problem) = (BTreeMap::new(), BTreeMap::new(), MapProblem::default());
         let mut world = Self { truth, frames, problem, next: 0 };
         for (robot, scale) in (0..).zip(scales) {
@@ -55,13 +55,13 @@ impl World {
         world
     }
 
-    pub(super) fn anchor(&self, id: SubmapId) -> Sim3 {
+    pub(crate) fn anchor(&self, id: SubmapId) -> Sim3 {
         let t = self.truth[&id];
         Sim3::new(t.rotation, t.translation, self.frames[&id.frame].scale)
     }
 
     /// The truth of `t_i_j` with noise (none if `rng` is `None`).
-    pub(super) fn measure(&self, rng: Option<&mut ChaCha8Rng>, i: SubmapId, j: SubmapId) -> Relative {
+    pub(crate) fn measure(&self, rng: Option<&mut ChaCha8Rng>, i: SubmapId, j: SubmapId) -> Relative {
         let truth = self.anchor(i).inverse() * self.anchor(j);
         let unknown = |id: SubmapId| self.problem.frames[&id.frame].scale == ScaleKind::Unknown;
         if i.frame != j.frame && (unknown(i) || unknown(j)) {
@@ -79,7 +79,7 @@ impl World {
         Relative::Metric(rng.map_or(PoseWithCovariance { pose, covariance }, |rng| measured(rng, &pose, covariance)))
     }
 
-    pub(super) fn state(&mut self, i: SubmapId, j: SubmapId, t_i_j: Relative) -> EntryId {
+    pub(crate) fn state(&mut self, i: SubmapId, j: SubmapId, t_i_j: Relative) -> EntryId {
         let entry = EntryId { frame: i.frame, seq: self.next };
         self.next += 1;
         self.problem.alignments.push(AgreedAlignment { entry, i, j, t_i_j });
@@ -87,7 +87,7 @@ impl World {
     }
 
     /// `count` alignments between each pair of frames, of distinct submaps.
-    pub(super) fn align_all(&mut self, rng: &mut ChaCha8Rng, count: usize, exact: bool) {
+    pub(crate) fn align_all(&mut self, rng: &mut ChaCha8Rng, count: usize, exact: bool) {
         let frames: Vec<FrameId> = self.frames.keys().copied().collect();
         for (k, &a) in frames.iter().enumerate() {
             for &b in &frames[k + 1..] {
@@ -96,7 +96,7 @@ impl World {
         }
     }
 
-    pub(super) fn align(&mut self, rng: &mut ChaCha8Rng, a: FrameId, b: FrameId, count: usize, exact: bool) {
+    pub(crate) fn align(&mut self, rng: &mut ChaCha8Rng, a: FrameId, b: FrameId, count: usize, exact: bool) {
         let anchors = self.problem.frames[&a].odometry.len();
         for k in 0..count {
             let (i, j) = (rng.random_range(0..anchors), (rng.random_range(0..anchors / count) * count + k) % anchors);
@@ -107,21 +107,21 @@ impl World {
         }
     }
 
-    pub(super) fn solve(&self) -> JointEstimate {
+    pub(crate) fn solve(&self) -> JointEstimate {
         solve_map(&self.problem, &EstimateConfig::default())
     }
 
-    pub(super) fn frame_truth(&self, a: FrameId, b: FrameId) -> Sim3 {
+    pub(crate) fn frame_truth(&self, a: FrameId, b: FrameId) -> Sim3 {
         self.frames[&a].inverse() * self.frames[&b]
     }
 }
 
-pub(super) fn rigid(t: &Relative) -> PoseWithCovariance {
+pub(crate) fn rigid(t: &Relative) -> PoseWithCovariance {
     *t.metric().expect("a rigid relation")
 }
 
 /// Everything an estimate says, as bits.
-pub(super) fn bits(map: &JointEstimate) -> Vec<u64> {
+pub(crate) fn bits(map: &JointEstimate) -> Vec<u64> {
     let mut out = vec![map.chi2.to_bits(), map.dof as u64, map.nodes as u64];
     let mut push = |t: &Relative| {
         let s = t.lifted();

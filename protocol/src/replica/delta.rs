@@ -22,9 +22,8 @@ impl Replica {
         let taken = self.take_turns(&lacking, first_turn(have, lacking.len()), left);
         for ((frame, range), taken) in lacking.iter_mut().zip(taken) {
             delta.more |= taken < range.end;
-            let held = self.log(*frame).into_iter().flat_map(|log| log.durable_entries());
-            let (skip, take) = (range.start as usize, (taken - range.start) as usize);
-            delta.entries.extend(held.skip(skip).take(take).map(|held| EntryBytes(held.bytes.to_vec())));
+            let held = (range.start..taken).filter_map(|seq| self.log(*frame)?.held(seq));
+            delta.entries.extend(held.map(|held| EntryBytes(held.bytes.to_vec())));
         }
         delta
     }
@@ -52,13 +51,15 @@ impl Replica {
         let range = |(frame, slot): (&FrameId, &Slot)| {
             let Slot::Log(log) = slot else { return None };
             let range = match have.head(*frame) {
-                None | Some(Head::Log { len: 0, .. }) => 0..log.durable,
+                None => log.first()..log.durable(),
                 Some(Head::Forked) => return None,
-                Some(Head::Log { len, tag }) => match (log.durable_entries().get(len as usize - 1), tag) {
+                // Below the floor there is nothing to send, or to compare.
+                Some(Head::Log { len, .. }) if len <= log.first() => log.first()..log.durable(),
+                Some(Head::Log { len, tag }) => match (log.held(len - 1).filter(|_| len <= log.durable()), tag) {
                     (None, _) => return None,
                     // Another history: our entry in that place is the asker's proof.
                     (Some(held), Some(tag)) if Head::tag_of(&held.hash) != tag => len - 1..len,
-                    (Some(_), _) => len..log.durable,
+                    (Some(_), _) => len..log.durable(),
                 },
             };
             (have.covers(*frame) && !range.is_empty()).then_some((*frame, range))

@@ -76,8 +76,13 @@ impl Replica {
     }
 
     /// Durable entries held, logs in quarantine left out.
+    pub fn held(&self) -> u64 {
+        self.logs().map(|(_, log)| log.durable_entries().len() as u64).sum()
+    }
+
+    /// Places of logs that are settled: durable entries, and those below floors. Logs in quarantine are left out.
     pub fn count(&self) -> u64 {
-        self.logs().map(|(_, log)| u64::from(log.durable)).sum()
+        self.logs().map(|(_, log)| u64::from(log.durable())).sum()
     }
 
     /// Root and count, to be announced.
@@ -103,7 +108,7 @@ impl Replica {
     pub fn have_named(&self, asker: RobotId, listed: bool, logs: impl IntoIterator<Item = FrameId>) -> HaveVector {
         let head = |frame| match self.slots.get(&frame) {
             Some(Slot::Forked(_)) => Head::Forked,
-            Some(Slot::Log(log)) => Head::Log { len: log.durable, tag: None },
+            Some(Slot::Log(log)) => Head::Log { len: log.durable(), tag: None },
             None => Head::Log { len: 0, tag: None },
         };
         let heads: BTreeMap<FrameId, Head> =
@@ -134,7 +139,7 @@ impl Replica {
         let ahead = |(frame, head): (FrameId, Head)| {
             let ours = match self.slots.get(&frame) {
                 Some(Slot::Forked(_)) => return None,
-                Some(Slot::Log(log)) => log.durable,
+                Some(Slot::Log(log)) => log.durable(),
                 None => 0,
             };
             let theirs = match head {
@@ -179,7 +184,7 @@ impl Replica {
             Slot::Forked(_) => Some((*frame, None)),
             Slot::Log(log) => {
                 let last = log.durable_entries().last()?;
-                Some((*frame, Some((log.durable, last.hash))))
+                Some((*frame, Some((log.durable(), last.hash))))
             }
         })
     }

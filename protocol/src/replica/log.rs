@@ -1,4 +1,8 @@
-//! One frame's log: its entries from 0 on, without holes, and which of them are durable.
+//! One frame's log: its entries from the writer's floor on, without holes, and which of them are durable.
+//!
+//! A floor is the place of an entry that states that very place as its floor: it replaces everything below it. Once it
+//! is durable what it replaces goes. A log whose next entry is not to be had any more (everybody else dropped it) goes
+//! on at the floor; until that is durable, what is held is shown as before.
 
 use crate::ids::Hash;
 use crate::wire::Entry;
@@ -26,17 +30,21 @@ pub(super) enum Link {
     Fits,
     /// It names another predecessor: a fork.
     Contradicts,
-    /// Its floor is below its predecessor's.
-    FloorFell,
+    /// Its floor is neither its predecessor's nor its own place.
+    FloorMoved,
 }
 
 /// One frame's log.
 #[derive(Default)]
 pub(super) struct Log {
-    /// Entries `0..`.
-    pub entries: Vec<Held>,
-    /// Entries `0..durable` are durable.
-    pub durable: u32,
+    /// Place of the first entry held.
+    first: u32,
+    /// Entries `first..`.
+    entries: Vec<Held>,
+    /// Entries `first..durable` are durable; at least `first`.
+    durable: u32,
+    /// What begins at a floor beyond the entries, until it is durable.
+    beyond: Option<Box<Log>>,
     /// Verified entries that wait for their predecessor. Bounded by the set.
     pub early: BTreeMap<u32, Entry>,
     /// Some entry came from another robot in this run.
@@ -46,46 +54,126 @@ pub(super) struct Log {
 impl Log {
     /// The next free place.
     pub fn next_seq(&self) -> u32 {
-        // Lengths are bounded by `entries_per_frame_max`, a u32.
-        self.entries.len() as u32
+        // Lengths are bounded by `entries_per_frame_max`, a u32, and no entry has the last place of all.
+        let last = self.last();
+        last.first + last.entries.len() as u32
+    }
+
+    /// Place of the first entry that may be shown to others.
+    pub fn first(&self) -> u32 {
+        self.first
+    }
+
+    /// Place after the last entry that may be shown to others.
+    pub fn durable(&self) -> u32 {
+        self.durable
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.last().entries.is_empty()
     }
 
     pub fn held(&self, seq: u32) -> Option<&Held> {
-        self.entries.get(seq as usize)
+        let part = self.beyond.as_deref().filter(|beyond| seq >= beyond.first).unwrap_or(self);
+        part.entries.get(seq.checked_sub(part.first)? as usize)
     }
 
-    /// Hash that the next entry must name; zero for the first.
-    pub fn head(&self) -> Hash {
-        self.entries.last().map(|held| held.hash).unwrap_or_default()
+    /// The last entry.
+    pub fn head(&self) -> Option<&Held> {
+        self.last().entries.last()
     }
 
-    /// The writer's floor as of the last entry.
+    /// Place from which on the writer wants its entries kept, as of the last one.
     pub fn floor(&self) -> u32 {
-        self.entries.last().map_or(0, |held| held.floor)
+        self.head().map_or(self.last().first, |held| held.floor)
     }
 
     /// Whether an entry, whose place is the next free one, may be pushed that names this predecessor and this floor.
     pub fn link(&self, previous: Hash, floor: u32) -> Link {
-        if previous != self.head() {
+        // Of what came before a first entry above 0 nothing is known.
+        let follows = match self.head() {
+            Some(head) => head.hash == previous,
+            None => self.next_seq() > 0 || previous == Hash::default(),
+        };
+        if !follows {
             Link::Contradicts
-        } else if floor < self.floor() {
-            Link::FloorFell
+        } else if floor != self.floor() && floor != self.next_seq() {
+            Link::FloorMoved
         } else {
             Link::Fits
         }
     }
 
+    /// Adds the next entry, of which [`Self::link`] says that it fits.
+    pub fn push(&mut self, held: Held) {
+        self.last_mut().entries.push(held);
+    }
+
+    /// Takes the last entry back.
+    pub fn pop(&mut self) -> Option<Held> {
+        self.last_mut().entries.pop()
+    }
+
+    /// Begins at `seq`, with nothing.
+    pub fn begin(seq: u32) -> Self {
+        Self { first: seq, durable: seq, ..Self::default() }
+    }
+
+    /// Goes on at the floor `seq`, beyond the next free place, with this entry.
+    pub fn jump(&mut self, seq: u32, held: Held) {
+        self.beyond = Some(Box::new(Self { entries: vec![held], ..Self::begin(seq) }));
+        self.early.retain(|place, _| *place > seq);
+    }
+
     pub fn mark_durable(&mut self, seq: u32) {
-        if let Some(held) = self.entries.get_mut(seq as usize) {
+        self.mark(seq);
+        if let Some(beyond) = &mut self.beyond {
+            beyond.mark(seq);
+        }
+        if let Some(beyond) = self.beyond.take_if(|beyond| beyond.durable > beyond.first) {
+            let Self { first, entries, durable, .. } = *beyond;
+            (self.first, self.entries, self.durable) = (first, entries, durable);
+        }
+        self.drop_replaced();
+    }
+
+    /// All that is held is durable.
+    pub fn mark_all_durable(&mut self) {
+        self.entries.iter_mut().for_each(|held| held.durable = true);
+        self.entries.shrink_to_fit();
+        self.durable = self.next_seq();
+        self.drop_replaced();
+    }
+
+    /// The entries that may be shown to others, from [`Self::first`] on.
+    pub fn durable_entries(&self) -> &[Held] {
+        &self.entries[..(self.durable - self.first) as usize]
+    }
+
+    fn mark(&mut self, seq: u32) {
+        let at = seq.checked_sub(self.first).map(|at| at as usize);
+        if let Some(held) = at.and_then(|at| self.entries.get_mut(at)) {
             held.durable = true;
         }
-        while self.held(self.durable).is_some_and(|held| held.durable) {
+        while self.entries.get((self.durable - self.first) as usize).is_some_and(|held| held.durable) {
             self.durable += 1;
         }
     }
 
-    /// The entries that may be shown to others.
-    pub fn durable_entries(&self) -> &[Held] {
-        &self.entries[..self.durable as usize]
+    /// What lies below the last durable entry's floor goes.
+    fn drop_replaced(&mut self) {
+        let floor = self.durable_entries().last().map_or(self.first, |held| held.floor);
+        if floor > self.first {
+            self.entries.drain(..(floor - self.first) as usize);
+            self.first = floor;
+        }
+    }
+
+    fn last(&self) -> &Self {
+        self.beyond.as_deref().unwrap_or(self)
+    }
+
+    fn last_mut(&mut self) -> &mut Self {
+        if self.beyond.is_some() { self.beyond.get_or_insert_default() } else { self }
     }
 }

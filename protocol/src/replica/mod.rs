@@ -10,6 +10,8 @@
 //!   the order, duplication or batching in which they came.
 
 mod delta;
+#[cfg(test)]
+mod floor_tests;
 mod fork;
 mod have;
 mod log;

@@ -1,8 +1,8 @@
 //! Loading a store. The hash chain is checked entry by entry, the signature only of each log's last entry: it covers its
 //! predecessor's hash, hence the whole log. 36,000 entries cost one hash each and one signature a log.
 
-use super::log::{Held, Link};
-use super::set::{IngestError, Ingested, Replica};
+use super::log::{Held, Link, Log};
+use super::set::{IngestError, Ingested, Replica, Slot};
 use crate::ids::{EntryId, FrameId, Hash};
 use crate::wire::Entry;
 use std::collections::BTreeMap;
@@ -67,6 +67,10 @@ impl Replica {
         for (frame, mut records) in logs {
             records.sort_by(|x, y| (x.seq, &x.bytes).cmp(&(y.seq, &y.bytes)));
             records.dedup_by(|x, y| x.bytes == y.bytes);
+            // What a floor replaces goes with the commit that brings the floor; of an old store more may be left.
+            if let Some(floor) = records.iter().filter(|record| record.floor == record.seq).map(|r| r.seq).max() {
+                records.retain(|record| record.seq >= floor);
+            }
             self.restore_log(frame, records, &mut damaged);
         }
         damaged.sort_by_key(|damage| damage.id);
@@ -91,20 +95,22 @@ impl Replica {
         if self.slots.contains_key(&frame) || self.check_epoch(frame).is_err() {
             return records;
         }
+        let first = records.first().filter(|record| record.floor == record.seq).map_or(0, |record| record.seq);
+        self.slots.insert(frame, Slot::Log(Log::begin(first)));
         let mut records = records.into_iter().peekable();
         let fits = |replica: &mut Self, record: &Stored| {
             let log = replica.log_mut(frame);
             let next = record.seq == log.next_seq() && matches!(log.link(record.previous, record.floor), Link::Fits);
-            next && replica.check_seq(EntryId { frame, seq: record.seq }).is_ok()
+            next && replica.check_place(EntryId { frame, seq: record.seq }, record.floor).is_ok()
         };
         while let Some(record) = records.next_if(|record| fits(self, record)) {
-            self.log_mut(frame).entries.push(Held::new(record.bytes.into(), record.floor));
+            self.log_mut(frame).push(Held::new(record.bytes.into(), record.floor));
         }
         let mut left = Vec::new();
-        while let Some(held) = self.log_mut(frame).entries.pop() {
+        while let Some(held) = self.log_mut(frame).pop() {
             let entry = Entry::decode(&held.bytes);
             if entry.as_ref().is_ok_and(|entry| self.verify(entry).is_ok()) {
-                self.log_mut(frame).entries.push(held);
+                self.log_mut(frame).push(held);
                 break;
             }
             // What was admitted can be decoded again.
@@ -112,11 +118,10 @@ impl Replica {
         }
         left.reverse();
         let log = self.log_mut(frame);
-        log.entries.shrink_to_fit();
-        let len = log.next_seq();
-        (0..len).for_each(|seq| log.mark_durable(seq));
+        log.mark_all_durable();
+        let nothing = log.is_empty();
         self.digest.take();
-        if len == 0 {
+        if nothing {
             self.slots.remove(&frame);
         }
         left.into_iter().chain(records).collect()

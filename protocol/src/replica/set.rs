@@ -6,8 +6,10 @@ use super::fork::ForkProof;
 use super::log::{Held, Link, Log};
 use crate::config::GossipConfig;
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
+use crate::wire::fact::CondensedFact;
 use crate::wire::{Beacon, Entry, EntryContent, EntryError, Fact, FactError, SwarmTag};
 use core::cell::OnceCell;
+use core::ops::Range;
 use ed25519_dalek::{SigningKey, VerifyingKey};
 use std::collections::BTreeMap;
 use thiserror::Error;
@@ -85,9 +87,9 @@ pub enum IngestError {
     /// The log is as long as is held.
     #[error("entry {0} is beyond gossip.entries_per_frame_max")]
     SeqLimit(EntryId),
-    /// The writer's floor falls: the log ends here, on every robot alike.
-    #[error("entry {0} lowers its writer's floor")]
-    FloorFell(EntryId),
+    /// The floor that it states is neither its predecessor's nor its own place: the log ends here, on every robot alike.
+    #[error("entry {0} states a floor that is neither its predecessor's nor its own place")]
+    FloorMoved(EntryId),
     /// Its predecessor is missing, and so many nearer ones wait already that it was not kept.
     #[error("entry {0} is too far ahead of what is held")]
     TooEarly(EntryId),
@@ -112,7 +114,7 @@ impl IngestError {
             Self::UnknownOrigin(_) => "unknown_origin",
             Self::EpochLimit(_) => "epoch_limit",
             Self::SeqLimit(_) => "seq_limit",
-            Self::FloorFell(_) => "floor_fell",
+            Self::FloorMoved(_) => "floor_moved",
             Self::TooEarly(_) => "too_early",
             Self::Quarantined(_) => "quarantined",
             Self::Fork(_) => "fork",
@@ -191,6 +193,49 @@ impl Replica {
     /// [`AppendError`]; no state changes.
     pub fn append(&mut self, key: &SigningKey, frame_epoch: u32, fact: &Fact) -> Result<Entry, AppendError> {
         let robot = RobotId::of_key(key.verifying_key().as_bytes());
+        let entry = self.next_entry(key, robot, frame_epoch, fact, false)?;
+        self.log_mut(entry.id().frame).push(Held::new(entry.encode().into(), entry.floor()));
+        Ok(entry)
+    }
+
+    /// Signs these facts as the next entries of this robot's log of `frame_epoch`; the first states its own place as the
+    /// floor, and once it is durable everything below it is gone, here and on every robot that hears of it.
+    ///
+    /// # Errors
+    /// [`AppendError`]; no state changes.
+    pub fn append_floor(
+        &mut self,
+        key: &SigningKey,
+        frame_epoch: u32,
+        parts: &[CondensedFact],
+    ) -> Result<Vec<Entry>, AppendError> {
+        let robot = RobotId::of_key(key.verifying_key().as_bytes());
+        let frame = FrameId { robot, epoch: frame_epoch };
+        let mut entries = Vec::with_capacity(parts.len());
+        for part in parts {
+            let fact = Fact::Condensed(part.clone());
+            match self.next_entry(key, robot, frame_epoch, &fact, entries.is_empty()) {
+                Ok(entry) => {
+                    self.log_mut(frame).push(Held::new(entry.encode().into(), entry.floor()));
+                    entries.push(entry);
+                }
+                Err(error) => {
+                    entries.iter().for_each(|_| drop(self.log_mut(frame).pop()));
+                    return Err(error);
+                }
+            }
+        }
+        Ok(entries)
+    }
+
+    fn next_entry(
+        &self,
+        key: &SigningKey,
+        robot: RobotId,
+        frame_epoch: u32,
+        fact: &Fact,
+        raises: bool,
+    ) -> Result<Entry, AppendError> {
         let frame = FrameId { robot, epoch: frame_epoch };
         if !self.members.contains_key(&robot) {
             return Err(AppendError::NotInRoster(robot));
@@ -204,15 +249,18 @@ impl Replica {
             Some(Slot::Log(log)) if log.received || !log.early.is_empty() => {
                 return needed("others hold entries of it that this store lost");
             }
-            Some(Slot::Log(log)) if log.next_seq() >= self.entries_per_frame_max => return needed("it is full"),
-            Some(Slot::Log(log)) => (log.next_seq(), log.floor(), log.head()),
+            Some(Slot::Log(log)) => {
+                let (next, floor) = (log.next_seq(), log.floor());
+                (next, if raises { next } else { floor }, log.head().map(|head| head.hash).unwrap_or_default())
+            }
             None => (0, 0, Hash::default()),
         };
-        let (kind, payload) = (fact.kind(), fact.to_payload()?);
         let id = EntryId { frame, seq };
-        let entry = Entry::sign(key, EntryContent { swarm: self.swarm, id, kind, floor, previous, payload })?;
-        self.log_mut(frame).entries.push(Held::new(entry.encode().into(), entry.floor()));
-        Ok(entry)
+        if self.check_place(id, floor).is_err() {
+            return needed("it is full");
+        }
+        let (kind, payload) = (fact.kind(), fact.to_payload()?);
+        Ok(Entry::sign(key, EntryContent { swarm: self.swarm, id, kind, floor, previous, payload })?)
     }
 
     /// Takes in an entry from anywhere.
@@ -228,14 +276,19 @@ impl Replica {
             Some(Slot::Log(log)) if log.held(id.seq).is_some_and(|held| *held.bytes == *bytes) => {
                 return Ok(Ingested::Known);
             }
+            // The writer has replaced it.
+            Some(Slot::Log(log)) if id.seq < log.first() => return Ok(Ingested::Known),
             Some(Slot::Log(log)) if log.early.get(&id.seq) == Some(&entry) => return Ok(Ingested::Early(id)),
             _ => {}
         }
         self.check_epoch(frame)?;
-        self.check_seq(id)?;
+        self.check_place(id, entry.floor())?;
         self.verify(&entry)?;
 
         let next = self.next_seq(frame);
+        if id.seq > next && entry.floor() == id.seq {
+            return self.jump(&entry, bytes);
+        }
         if id.seq > next {
             return self.hold_early(entry, bytes);
         }
@@ -243,11 +296,20 @@ impl Replica {
             let other = held.bytes.to_vec();
             return Err(self.fork(frame, &other, bytes));
         }
-        self.push(entry, bytes)?;
+        // A gap that a floor has jumped: what lay in it is gone.
+        if self.log(frame).is_some_and(|log| log.held(id.seq).is_none() && id.seq < next) {
+            return Ok(Ingested::Known);
+        }
+        self.push(&entry, bytes)?;
+        self.with_early(id)
+    }
+
+    /// This new entry, and those that had waited for it.
+    fn with_early(&mut self, id: EntryId) -> Result<Ingested, IngestError> {
         let mut new = vec![id];
-        while let Some(entry) = self.take_early(frame) {
+        while let Some(entry) = self.take_early(id.frame) {
             let id = entry.id();
-            match self.push(entry.clone(), &entry.encode()) {
+            match self.push(&entry, &entry.encode()) {
                 Ok(()) => new.push(id),
                 Err(IngestError::Fork(frame)) => return Err(IngestError::Fork(frame)),
                 Err(_) => break,
@@ -279,7 +341,7 @@ impl Replica {
     pub fn entries(&self) -> impl Iterator<Item = (EntryId, &[u8])> {
         self.logs().flat_map(|(frame, log)| {
             let id = move |seq| EntryId { frame, seq };
-            (0..log.durable).zip(log.durable_entries()).map(move |(seq, held)| (id(seq), &*held.bytes))
+            (log.first()..).zip(log.durable_entries()).map(move |(seq, held)| (id(seq), &*held.bytes))
         })
     }
 
@@ -287,6 +349,17 @@ impl Replica {
     /// passed over, on every robot alike.
     pub fn facts(&self) -> impl Iterator<Item = (EntryId, Fact)> {
         self.entries().filter_map(|(id, bytes)| Some((id, Entry::decode(bytes).ok()?.fact().ok()?)))
+    }
+
+    /// The places that are held of a log, if all of them are durable.
+    pub fn settled(&self, frame: FrameId) -> Option<Range<u32>> {
+        let log = self.log(frame)?;
+        (log.durable() == log.next_seq()).then(|| log.first()..log.durable())
+    }
+
+    /// Whether this entry is held and replaces all below it.
+    pub fn is_floor(&self, id: EntryId) -> bool {
+        id.seq > 0 && self.log(id.frame).and_then(|log| log.held(id.seq)).is_some_and(|held| held.floor == id.seq)
     }
 
     /// One entry, durable or not.
@@ -342,8 +415,11 @@ impl Replica {
         Err(IngestError::EpochLimit(frame.robot))
     }
 
-    pub(super) fn check_seq(&self, id: EntryId) -> Result<(), IngestError> {
-        if id.seq < self.entries_per_frame_max { Ok(()) } else { Err(IngestError::SeqLimit(id)) }
+    /// Whether an entry that states this floor may be held: entries from a floor on are counted, and the last place of
+    /// all stays free.
+    pub(super) fn check_place(&self, id: EntryId, floor: u32) -> Result<(), IngestError> {
+        let fits = id.seq.saturating_sub(floor) < self.entries_per_frame_max && id.seq < u32::MAX;
+        if fits { Ok(()) } else { Err(IngestError::SeqLimit(id)) }
     }
 
     pub(super) fn verify(&self, entry: &Entry) -> Result<(), IngestError> {
@@ -375,23 +451,35 @@ impl Replica {
     }
 
     /// Pushes a verified entry whose place is the next free one.
-    fn push(&mut self, entry: Entry, bytes: &[u8]) -> Result<(), IngestError> {
+    fn push(&mut self, entry: &Entry, bytes: &[u8]) -> Result<(), IngestError> {
         let id = entry.id();
         let link = self.log(id.frame).map_or(Link::Fits, |log| log.link(entry.previous(), entry.floor()));
         match link {
             Link::Fits => {
                 let log = self.log_mut(id.frame);
                 log.received = true;
-                log.entries.push(Held::new(bytes.into(), entry.floor()));
+                log.push(Held::new(bytes.into(), entry.floor()));
                 Ok(())
             }
-            Link::FloorFell => Err(IngestError::FloorFell(id)),
+            Link::FloorMoved => Err(IngestError::FloorMoved(id)),
             Link::Contradicts => {
-                let last = self.log(id.frame).and_then(|log| log.entries.last());
+                let last = self.log(id.frame).and_then(Log::head);
                 let other = last.map(|held| held.bytes.to_vec()).unwrap_or_default();
                 Err(self.fork(id.frame, &other, bytes))
             }
         }
+    }
+
+    /// Goes on at a verified entry that is a floor, beyond the next free place.
+    fn jump(&mut self, entry: &Entry, bytes: &[u8]) -> Result<Ingested, IngestError> {
+        let id = entry.id();
+        let log = self.log_mut(id.frame);
+        if let Some(other) = log.early.get(&id.seq).map(Entry::encode) {
+            return Err(self.fork(id.frame, &other, bytes)); // the same one was answered before
+        }
+        log.received = true;
+        log.jump(id.seq, Held::new(bytes.into(), entry.floor()));
+        self.with_early(id)
     }
 
     fn fork(&mut self, frame: FrameId, a: &[u8], b: &[u8]) -> IngestError {

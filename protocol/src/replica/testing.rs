@@ -3,7 +3,7 @@
 use super::*;
 use crate::config::GossipConfig;
 use crate::ids::{EntryId, FrameId, Hash, RobotId};
-use crate::wire::fact::ScaleKind;
+use crate::wire::fact::{CarriedFact, CondensedFact, ScaleKind};
 use crate::wire::samples::{self, key};
 use crate::wire::{Entry, EntryContent, Fact, HaveVector, SwarmTag};
 
@@ -44,6 +44,26 @@ pub fn signed(n: u8, epoch: u32, seq: u32, floor: u32, previous: Hash, fact: &Fa
     let (kind, payload) = (fact.kind(), fact.to_payload().unwrap());
     let swarm = SwarmTag::of(&samples::swarm());
     Entry::sign(&key(n), EntryContent { swarm, id, kind, floor, previous, payload }).unwrap()
+}
+
+/// [`chain`] of `len` entries, then one that replaces them in two parts, then `more`.
+pub fn condensed_chain(n: u8, epoch: u32, len: u32, more: u32) -> Vec<Vec<u8>> {
+    let mut writer = replica();
+    for seq in 0..len {
+        writer.append(&key(n), epoch, &fact(seq)).unwrap();
+    }
+    let mut all: Vec<Vec<u8>> = (0..len).map(|seq| bytes_of(&writer, n, epoch, seq)).collect();
+    let part = |seqs: [u32; 2]| CondensedFact {
+        carried: seqs.map(|seq| CarriedFact { seq, after: None, fact: fact(seq) }).to_vec(),
+    };
+    let parts = writer.append_floor(&key(n), epoch, &[part([0, 1]), part([2, 3])]).unwrap();
+    all.extend(parts.iter().map(Entry::encode));
+    all.extend((0..more).map(|k| writer.append(&key(n), epoch, &fact(len + k)).unwrap().encode()));
+    all
+}
+
+fn bytes_of(replica: &Replica, n: u8, epoch: u32, seq: u32) -> Vec<u8> {
+    replica.entry_bytes(EntryId { frame: frame(n, epoch), seq }).unwrap().to_vec()
 }
 
 /// Makes all that is held durable.

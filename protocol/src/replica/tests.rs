@@ -149,7 +149,7 @@ fn floors_never_fall() {
     let falls = signed(1, 0, 2, 0, b.hash(), &fact(2));
     let stays = signed(1, 0, 2, 1, b.hash(), &fact(2));
     feed(&mut replica, &[a.encode(), b.encode()]);
-    assert_eq!(replica.ingest(&falls.encode()), Err(IngestError::FloorFell(id(1, 0, 2))));
+    assert_eq!(replica.ingest(&falls.encode()), Err(IngestError::FloorMoved(id(1, 0, 2))));
     assert!(matches!(replica.ingest(&stays.encode()), Ok(Ingested::New(_))));
 }
 

@@ -17,6 +17,8 @@ pub enum Fact {
     Verdict(VerdictFact),
     /// A direct measurement of another robot.
     Sighting(SightingFact),
+    /// What still counts of the writer's entries below its floor.
+    Condensed(CondensedFact),
 }
 
 /// Whether a frame's unit is the metre.
@@ -126,4 +128,25 @@ pub struct SightingFact {
     pub j: SubmapId,
     /// `t_i_j`.
     pub t_i_j: PoseWithCovariance,
+}
+
+/// A part of what still counts of the entries below the writer's floor (DESIGN §3, §7): facts that are carried on, each
+/// with the place it had, so that whatever names it still finds it. The first part states its own place as the floor,
+/// and replaces every entry below at once; the other parts follow it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CondensedFact {
+    /// By their places, rising; one at least.
+    pub carried: Vec<CarriedFact>,
+}
+
+/// One fact that is carried on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CarriedFact {
+    /// Its place in the log.
+    pub seq: u32,
+    /// For a submap, the index of the one that its odometry begins at, `None` for the origin of the frame: the submaps
+    /// between them are gone, and their steps are compounded. `None` for other facts.
+    pub after: Option<u32>,
+    /// As it was stated, but for a submap's odometry. Never condensed itself.
+    pub fact: Fact,
 }

@@ -20,7 +20,7 @@ pub struct HaveRoot {
     /// First bytes of the digest.
     #[serde(serialize_with = "super::json::tag")]
     pub root: [u8; 8],
-    /// Durable entries held: a hint at who has more.
+    /// Places of logs that are settled (durable, or below a floor): a hint at who has more.
     pub count: u64,
 }
 

@@ -78,8 +78,8 @@ pub(super) fn entry(bytes: &[u8]) -> Value {
     }
 }
 
-fn fact(fact: &Fact) -> Value {
-    match fact {
+fn fact(of: &Fact) -> Value {
+    match of {
         Fact::Submap(f) => json!({
             "index": f.index,
             "stamps_secs": f.stamps.map(|stamp| stamp.as_secs_f64()),
@@ -113,6 +113,14 @@ fn fact(fact: &Fact) -> Value {
             "i": f.i.to_string(),
             "j": f.j.to_string(),
             "t_i_j": pose(&f.t_i_j),
+        }),
+        Fact::Condensed(f) => json!({
+            "carried": f.carried.iter().map(|one| json!({
+                "seq": one.seq,
+                "kind": Fact::kind_name(one.fact.kind()),
+                "after": one.after,
+                "fact": fact(&one.fact),
+            })).collect::<Vec<_>>(),
         }),
     }
 }

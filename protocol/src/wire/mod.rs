@@ -3,6 +3,7 @@
 //! who may say what, and in which order, is the replica's business.
 
 pub mod beacon;
+mod condensed;
 pub mod entry;
 pub mod fact;
 pub mod frame;

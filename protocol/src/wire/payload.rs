@@ -2,6 +2,7 @@
 //! they become checked domain values. Writing a fact projects it onto what can be written exactly, so that
 //! `parse ∘ encode ∘ parse = parse` to the bit, and a payload that is not the encoding of its own parse is refused.
 
+use super::condensed::RawCondensed;
 use super::fact::{
     AlignmentFact, Fact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
 };
@@ -22,6 +23,8 @@ pub const KIND_ALIGNMENT: u8 = 2;
 pub const KIND_VERDICT: u8 = 3;
 /// Entry kind of a [`SightingFact`].
 pub const KIND_SIGHTING: u8 = 4;
+/// Entry kind of a [`CondensedFact`](super::fact::CondensedFact).
+pub const KIND_CONDENSED: u8 = 5;
 
 /// Why a payload is no fact, or a fact cannot be written. No state changes.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -82,6 +85,7 @@ impl Fact {
             Self::Alignment(_) => KIND_ALIGNMENT,
             Self::Verdict(_) => KIND_VERDICT,
             Self::Sighting(_) => KIND_SIGHTING,
+            Self::Condensed(_) => KIND_CONDENSED,
         }
     }
 
@@ -92,6 +96,7 @@ impl Fact {
             KIND_ALIGNMENT => "alignment",
             KIND_VERDICT => "verdict",
             KIND_SIGHTING => "sighting",
+            KIND_CONDENSED => "condensed",
             _ => "unknown",
         }
     }
@@ -139,6 +144,7 @@ enum Raw {
     Alignment(RawAlignment),
     Verdict(RawVerdict),
     Sighting(RawSighting),
+    Condensed(RawCondensed),
 }
 
 impl Raw {
@@ -148,6 +154,7 @@ impl Raw {
             Fact::Alignment(f) => Self::Alignment(RawAlignment::of(f)?),
             Fact::Verdict(f) => Self::Verdict(RawVerdict::of(f)?),
             Fact::Sighting(f) => Self::Sighting(RawSighting::of(f)?),
+            Fact::Condensed(f) => Self::Condensed(RawCondensed::of(f)?),
         })
     }
 
@@ -157,6 +164,7 @@ impl Raw {
             Self::Alignment(raw) => Fact::Alignment(raw.parse()?),
             Self::Verdict(raw) => Fact::Verdict(raw.parse()?),
             Self::Sighting(raw) => Fact::Sighting(raw.parse()?),
+            Self::Condensed(raw) => Fact::Condensed(raw.parse()?),
         })
     }
 
@@ -166,6 +174,7 @@ impl Raw {
             Self::Alignment(raw) => to_bytes(raw),
             Self::Verdict(raw) => to_bytes(raw),
             Self::Sighting(raw) => to_bytes(raw),
+            Self::Condensed(raw) => to_bytes(raw),
         }
     }
 
@@ -175,6 +184,7 @@ impl Raw {
             KIND_ALIGNMENT => Self::Alignment(whole(bytes)?),
             KIND_VERDICT => Self::Verdict(whole(bytes)?),
             KIND_SIGHTING => Self::Sighting(whole(bytes)?),
+            KIND_CONDENSED => Self::Condensed(whole(bytes)?),
             other => return Err(FactError::UnknownKind(other)),
         })
     }

@@ -109,6 +109,7 @@ samples! {
                 t_i_j: estimate(),
             })
         }
+        Fact::Condensed(_) => { "condensed" => condensed_fact() }
     }
 }
 
@@ -221,6 +222,17 @@ pub fn submap_fact(scale: ScaleKind) -> Fact {
         keypoint_count: 256,
         blob: Hash::of(b"blob"),
         scale,
+    })
+}
+
+fn condensed_fact() -> Fact {
+    let carried = |seq, after, fact| CarriedFact { seq, after, fact };
+    Fact::Condensed(CondensedFact {
+        carried: vec![
+            carried(3, Some(4), submap_fact(ScaleKind::Metric)),
+            carried(5, None, alignment_fact(Relative::Metric(estimate()))),
+            carried(300, None, verdict_fact(VerdictOutcome::Refused(RefusalReason::NoConsensus))),
+        ],
     })
 }
 

@@ -197,7 +197,7 @@ impl Wires {
     fn carry(&mut self, k: usize, output: Output) {
         match output {
             Output::Persist { batch, records } => {
-                self.disks[k].extend(records);
+                records.into_iter().for_each(|record| put(&mut self.disks[k], record));
                 self.inbox.push_back((k, Input::Persisted { up_to: batch }));
             }
             Output::Publish { channel, bytes } => {
@@ -230,4 +230,15 @@ impl Wires {
             Output::Event(event) => self.events.push((k, event)),
         }
     }
+}
+
+/// What a disk does with a record.
+fn put(disk: &mut Vec<Record>, record: Record) {
+    let Record::Replaced { below, submaps, blobs } = record else { return disk.push(record) };
+    disk.retain(|record| match record {
+        Record::Entry { id, .. } => id.frame != below.frame || id.seq >= below.seq,
+        Record::Private { submap, .. } => !submaps.contains(submap),
+        Record::Blob { hash, .. } => !blobs.contains(hash),
+        _ => true,
+    });
 }

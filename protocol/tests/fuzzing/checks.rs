@@ -6,7 +6,7 @@ use super::people::{MEMBERS, config, key, robot};
 use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::{AskToken, Channel, Event, JobId, Output, QueryId, QueryKind, Record};
 use merganser_protocol::agent::job::{Job, JobResult};
-use merganser_protocol::ids::{EntryId, RobotId};
+use merganser_protocol::ids::{EntryId, FrameId, RobotId};
 use merganser_protocol::wire::limits::{BLOB_LEN_MAX, ENTRY_LEN_MAX};
 use merganser_protocol::wire::{Entry, Message};
 use std::collections::{BTreeMap, BTreeSet};
@@ -37,6 +37,8 @@ pub struct Shell {
     waiting: BTreeMap<u64, Vec<Record>>,
     /// All that is on the disk.
     pub disk: Vec<Record>,
+    /// How long each log is whose entries were ever durable.
+    places: BTreeMap<FrameId, u32>,
     durable: BTreeSet<Vec<u8>>,
     said: BTreeMap<EntryId, Vec<u8>>,
     pub jobs: Vec<(JobId, Job)>,
@@ -60,10 +62,23 @@ impl Shell {
         let later = self.waiting.split_off(&up_to.saturating_add(1));
         for record in core::mem::replace(&mut self.waiting, later).into_values().flatten() {
             if let Record::Entry { bytes, .. } = &record {
+                let id = Entry::decode(bytes).unwrap().id();
+                let len = self.places.entry(id.frame).or_default();
+                *len = (*len).max(id.seq + 1);
                 self.durable.insert(bytes.clone());
             }
-            self.disk.push(record);
+            self.store(record);
         }
+    }
+
+    fn store(&mut self, record: Record) {
+        let Record::Replaced { below, submaps, blobs } = record else { return self.disk.push(record) };
+        self.disk.retain(|record| match record {
+            Record::Entry { id, .. } => id.frame != below.frame || id.seq >= below.seq,
+            Record::Private { submap, .. } => !submaps.contains(submap),
+            Record::Blob { hash, .. } => !blobs.contains(hash),
+            _ => true,
+        });
     }
 
     /// The process dies: what was not durable is gone, and so are all jobs and questions.
@@ -151,7 +166,9 @@ impl Shell {
                 }
             }
             (Channel::Have, Message::Have(have)) => {
-                assert!(have.count <= self.durable.len() as u64, "advertised before it is durable");
+                // Places below a floor count as well.
+                let places: u64 = self.places.values().map(|len| u64::from(*len)).sum();
+                assert!(have.count <= places, "advertised before it is durable");
             }
             (channel, other) => panic!("{other:?} on channel {channel:?}"),
         }
@@ -179,13 +196,14 @@ impl Shell {
         let count = |kind: &str| self.jobs.iter().filter(|(_, job)| job.kind() == kind).count();
         assert!(count("align") <= config.align.jobs_max && count("describe") <= 1 && count("solve") <= 1);
         assert!(status.entries <= self.durable.len() as u64);
+        let logs = agent.heads().count() as u64;
+        assert!(status.entries <= logs * u64::from(config.gossip.entries_per_frame_max), "{} entries", status.entries);
         let pending = BATCHES_WAITING_MAX + DESCRIBE_QUEUE_MAX + 1;
         assert!(status.unsaved <= pending as u64, "{} records and submaps wait", status.unsaved);
         let aligning = config.align.jobs_max + config.align.candidates_max + VERIFICATIONS_MAX;
         assert!(status.pending - status.unsaved <= aligning as u64, "{} pairs wait", status.pending);
         let mut epochs = BTreeMap::<RobotId, usize>::new();
-        for (frame, len) in agent.heads() {
-            assert!(len.is_none_or(|len| len <= config.gossip.entries_per_frame_max), "{frame} holds {len:?}");
+        for (frame, _) in agent.heads() {
             *epochs.entry(frame.robot).or_default() += 1;
         }
         // Its own epochs an agent counts itself.
@@ -207,6 +225,6 @@ fn check_record(record: &Record) {
         }
         Record::Blob { bytes, .. } => assert!(bytes.len() <= BLOB_LEN_MAX),
         Record::Fork { proof: [a, b], .. } => assert!(a.len() + b.len() <= 2 * ENTRY_LEN_MAX && a != b),
-        Record::Private { .. } | Record::EpochClosed { .. } => {}
+        Record::Private { .. } | Record::EpochClosed { .. } | Record::Replaced { .. } => {}
     }
 }

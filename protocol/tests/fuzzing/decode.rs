@@ -9,12 +9,12 @@ use merganser_protocol::replica::Replica;
 use merganser_protocol::submap::{Features, Keypoints, Summary, Surfel};
 use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
 use merganser_protocol::wire::limits::{
-    BLOB_LEN_MAX, ENTRY_LEN_MAX, MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX, PAYLOAD_LEN_MAX, SUMMARY_LEN_MAX,
+    BLOB_LEN_MAX, CARRIED_MAX, ENTRY_LEN_MAX, MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX, PAYLOAD_LEN_MAX, SUMMARY_LEN_MAX,
 };
 use merganser_protocol::wire::{Delta, Entry, HaveVector, Message, SwarmTag};
 
-/// Fact kinds 1 to 4 and one on either side.
-const KINDS: core::ops::RangeInclusive<u8> = 0..=5;
+/// Fact kinds 1 to 5 and one on either side.
+const KINDS: core::ops::RangeInclusive<u8> = 0..=6;
 
 /// Panics if a decoder does anything but refuse or give back what it was given.
 pub fn decode(bytes: &[u8], meter: &impl Meter) {
@@ -107,6 +107,13 @@ fn check_fact(kind: u8, payload: &[u8], meter: &impl Meter) {
         Fact::Sighting(f) => {
             assert!(f.i != f.j);
             assert_finite(&Relative::Metric(f.t_i_j));
+        }
+        Fact::Condensed(f) => {
+            assert!((1..=CARRIED_MAX).contains(&f.carried.len()) && f.carried.is_sorted_by(|a, b| a.seq < b.seq));
+            for one in f.carried {
+                assert_ne!(one.fact.kind(), kind, "no facts within facts within facts");
+                check_fact(one.fact.kind(), &one.fact.to_payload().unwrap(), meter);
+            }
         }
     }
 }

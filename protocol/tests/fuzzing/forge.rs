@@ -8,7 +8,8 @@ use merganser_protocol::geometry::{PoseWithCovariance, Relative, Se3, Sim3, SimW
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::{
-    AlignmentFact, Fact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
+    AlignmentFact, CarriedFact, CondensedFact, Fact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact,
+    VerdictOutcome,
 };
 use merganser_protocol::wire::limits::{BLOB_PIECE_LEN, PAYLOAD_LEN_MAX};
 use merganser_protocol::wire::{
@@ -49,14 +50,18 @@ impl Forge {
         let way = r.below(16);
         let log = self.logs.entry(frame).or_default();
         let (mut seq, mut previous) = (log.len() as u32, log.last().map(|last| Hash::of(last)).unwrap_or_default());
-        let (mut floor, mut signer, mut tag) = (0, who, SwarmTag::of(&swarm()));
+        let before = log.last().and_then(|last| Entry::decode(last).ok()).map_or(0, |last| last.floor());
+        let (mut floor, mut signer, mut tag) = (before, who, SwarmTag::of(&swarm()));
         match way {
             0 if !log.is_empty() => return log[r.below(log.len())].clone(),
             1 if !log.is_empty() => {
                 seq = r.below(log.len()) as u32;
                 previous = seq.checked_sub(1).map(|before| Hash::of(&log[before as usize])).unwrap_or_default();
             }
-            2 => (seq, previous) = (seq + 1 + u32::from(r.byte()), Hash::of(b"not yet written")),
+            2 => {
+                (seq, previous) = (seq + 1 + u32::from(r.byte()), Hash::of(b"not yet written"));
+                floor = if r.one_in(2) { seq } else { floor };
+            }
             3 if seq > 0 => previous = Hash::of(b"another history"),
             4 => floor = seq,
             5 => signer = (who + 1) % ROBOTS,
@@ -64,6 +69,7 @@ impl Forge {
             7 => (seq, previous) = (u32::MAX, Hash::of(b"the last of all")),
             _ => {}
         }
+        floor = floor.min(seq); // more cannot be signed
         let content = EntryContent { swarm: tag, id: EntryId { frame, seq }, kind, floor, previous, payload };
         let bytes = Entry::sign(key(signer), content).unwrap().encode();
         if way > 7 || way == 4 || way == 0 {
@@ -103,6 +109,13 @@ impl Forge {
                     VerdictOutcome::Measured { t_i_j: relative(r), sigma: r.number() as f32, support: 9 }
                 };
                 Fact::Verdict(VerdictFact { alignment: EntryId { frame, seq: u32::from(place % 8) }, outcome })
+            }
+            6 if r.one_in(2) => {
+                let carried = (0..r.below(4) as u32).map(|seq| {
+                    let after = if r.one_in(2) { Some(u32::from(r.byte() % 4)) } else { None };
+                    CarriedFact { seq, after, fact: Fact::Submap(submap_fact(r)) }
+                });
+                Fact::Condensed(CondensedFact { carried: carried.collect() })
             }
             6 => {
                 let (i, j) = (self.submap(r), self.submap(r));

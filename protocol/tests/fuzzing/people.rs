@@ -73,6 +73,7 @@ pub fn config() -> Config {
     config.estimate.interval_secs = 0.1;
     config.gossip.delta_bytes_max = 4096;
     config.gossip.entries_per_frame_max = 12;
+    config.gossip.condense_entries = 5;
     config.gossip.epochs_per_robot_max = 3;
     config
 }

@@ -315,7 +315,7 @@ impl<'m, M: Meter> Story<'m, M> {
                     *bytes = r.mangled(core::mem::take(bytes));
                 }
                 Record::Fork { proof, .. } => proof.swap(0, 1),
-                Record::EpochClosed { .. } => {}
+                Record::EpochClosed { .. } | Record::Replaced { .. } => {}
             }
             records.iter_mut().filter(|other| *other == record).for_each(|other| other.clone_from(&damaged));
         }

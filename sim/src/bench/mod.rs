@@ -12,6 +12,7 @@ pub mod peers;
 pub mod places;
 pub mod registration;
 pub mod row;
+pub mod share;
 pub mod solve;
 pub mod table;
 
@@ -43,6 +44,11 @@ pub enum Bench {
     /// Alignments are one way: one submap's keypoints against the other's features. Times are of the processor. Exit code 1
     /// if a wrong alignment was accepted or fewer were found than promised, 2 if the data cannot be used.
     Places(places::Places),
+    /// Pose graphs split among robots who share their measurements: bytes sent until all have the whole optimum
+    ///
+    /// Exit code 1 if a robot's minimum is not that of the whole graph (1e-9), or robots differ; 2 if a file cannot be
+    /// used.
+    Share(share::Share),
     /// A flood of unknown ids: how much slower honest robots converge, and how much memory it takes
     ///
     /// The same swarm of real agents runs without and with 10,000 messages of strangers a second at two of its robots,
@@ -72,6 +78,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Gossip(options) => gossip::run(&options),
         Bench::Graph(options) => graph::run(&options),
         Bench::Places(options) => places::run(&options),
+        Bench::Share(options) => share::run(&options),
         Bench::Flood(options) => flood::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }

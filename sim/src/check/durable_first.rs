@@ -93,7 +93,7 @@ fn sendable(record: &Record, doubted: &BTreeSet<RobotId>) -> Option<Vec<u8>> {
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } => {
             (bytes.len() >= RECORD_LEN_MIN).then(|| bytes.clone())
         }
-        Record::Private { .. } | Record::Fork { .. } | Record::EpochClosed { .. } => None,
+        Record::Private { .. } | Record::Fork { .. } | Record::EpochClosed { .. } | Record::Replaced { .. } => None,
     }
 }
 

@@ -6,6 +6,7 @@ mod closed;
 mod contract;
 mod converged;
 mod durable_first;
+mod floors;
 mod honest_covariance;
 mod merged_as_expected;
 mod never_back;
@@ -106,6 +107,8 @@ pub struct RobotSample {
     pub disk_bytes: u64,
     /// What it believes.
     pub snapshot: Option<Snapshot>,
+    /// It measures falsehoods, and so lies to itself: between two frames of its own there is no second witness.
+    pub lies: bool,
 }
 
 /// A broken invariant.
@@ -131,6 +134,7 @@ impl Checks {
             Box::<unique_entries::UniqueEntries>::default(),
             Box::<never_back::NeverBack>::default(),
             Box::<closed::Closed>::default(),
+            Box::<floors::Floors>::default(),
             Box::<bounded::Bounded>::default(),
             Box::new(same_facts::SameFacts),
             Box::new(same_estimate::SameEstimate),
@@ -206,7 +210,7 @@ pub(crate) mod tests {
             frames,
             poses: PosesView { robots: Vec::new() },
             map: MapView { submaps: Vec::new() },
-            graph: GraphView { nodes: 0, chi2: 0.0, dof: 0, edges: Vec::new() },
+            graph: GraphView { nodes: 0, chi2: 0.0, dof: 0, optimality: Default::default(), edges: Vec::new() },
             stats: StatsView::default(),
         };
         RobotSample {
@@ -216,6 +220,7 @@ pub(crate) mod tests {
             logs: BTreeMap::new(),
             disk_bytes: 0,
             snapshot: Some(snapshot),
+            lies: false,
         }
     }
 

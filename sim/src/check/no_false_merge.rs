@@ -58,4 +58,19 @@ mod tests {
         assert!(verdict(0.49, 0.0).is_ok() && verdict(0.51, 0.0).is_err());
         assert!(verdict(0.0, 4.9).is_ok() && verdict(0.0, 5.1).is_err());
     }
+
+    #[test]
+    fn a_liar_may_deceive_itself_of_itself_alone() {
+        let truth = BTreeMap::from(["alpha/1", "alpha/2", "beta/1"].map(|frame| (frame.to_owned(), Se3::identity())));
+        let expect = Expect { error_max_m: 0.5, error_max_deg: 5.0, ..Expect::default() };
+        let verdict = |lies: bool, frame: &str| {
+            let off = Se3::exp(&Vector6::new(9.0, 0.0, 0.0, 0.0, 0.0, 0.0));
+            let mut robot = robot("alpha", 1, &[(frame, relation(off, 1.0))]);
+            robot.lies = lies;
+            NoFalseMerge.sample(&sample(vec![robot], &truth, &expect))
+        };
+        assert!(verdict(true, "alpha/2").is_ok());
+        assert!(verdict(false, "alpha/2").is_err());
+        assert!(verdict(true, "beta/1").is_err());
+    }
 }

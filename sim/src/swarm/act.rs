@@ -9,7 +9,7 @@ use crate::network::{Tampering, millis};
 use crate::world::drive::Step;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, Output, QueryKind};
 use merganser_protocol::agent::job::{Job, JobResult};
-use merganser_protocol::geometry::Se3;
+use merganser_protocol::submap::Submap;
 use merganser_protocol::time::Instant;
 
 /// A timeout is never nearer than this, so that virtual time moves even under a core that is always due.
@@ -150,10 +150,14 @@ impl<C: Core> Swarm<C> {
             return self.stopwatch.time(job.kind(), || job.run());
         };
         let (one, steps) = (&self.robots[robot], self.stage.steps(drive));
-        let locate = |t_frame_anchor: &Se3| {
-            let apart = |step: &&Step| (one.slam.t_frame_body(step).translation - t_frame_anchor.translation).norm();
-            let nearest = steps.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))?;
-            Some(nearest.t_world_body)
+        // Among the submap's own keyframes: near their origins, two frames of one robot know the same poses.
+        let locate = |submap: &Submap| {
+            let [a, b] = submap.stamps.map(|stamp| one.slam.drive_nanos(stamp.as_secs_f64()));
+            let span = a.min(b)..=a.max(b);
+            let anchor = submap.t_frame_anchor.translation;
+            let apart = |step: &&Step| (one.slam.t_frame_body(step).translation - anchor).norm();
+            let own = steps.iter().filter(|step| span.contains(&step.nanos));
+            Some(own.min_by(|a, b| apart(a).total_cmp(&apart(b)))?.t_world_body)
         };
         let kind = job.kind();
         let (result, lied) = self.stopwatch.time(kind, || standin.run(one.name.as_str(), job, locate));
@@ -240,7 +244,8 @@ impl<C: Core> Swarm<C> {
         let incarnation = self.robots[robot].incarnation;
         match output {
             Output::Persist { batch, records } => {
-                self.robots[robot].hands_over(batch, &records);
+                let writes = self.robots[robot].core.as_ref().map(|core| core.frame().epoch);
+                self.robots[robot].hands_over(writes, batch, &records);
                 let store = &mut self.robots[robot].store;
                 store.accept(batch, records);
                 // What comes while a commit is on its way shares it.
@@ -298,6 +303,7 @@ impl<C: Core> Swarm<C> {
             }
             Output::Event(event) => {
                 self.counts.epochs_begun += u64::from(matches!(event, Told::EpochBegan { .. }));
+                self.counts.condensed += u64::from(matches!(event, Told::Condensed { .. }));
                 self.counts.forks += u64::from(is_fork(&event));
                 if self.told.len() < TOLD_MAX {
                     self.told.push((now.as_secs_f64(), robot, event));

@@ -50,6 +50,7 @@ impl<C: Core> Swarm<C> {
 
     pub(super) fn robot_samples(&mut self, now: Instant) -> Vec<RobotSample> {
         let stopwatch = &mut self.stopwatch;
+        let liars = self.scenario.summary.as_ref().map_or(&[][..], |summary| &summary.liars);
         let mut sample = |(index, robot): (usize, &Robot<C>)| {
             let local = robot.local(now);
             let core = robot.core.as_ref()?;
@@ -60,6 +61,7 @@ impl<C: Core> Swarm<C> {
                 logs: core.logs(),
                 disk_bytes: robot.store.disk().len(),
                 snapshot: stopwatch.time("snapshot", || core.snapshot(local)),
+                lies: liars.iter().any(|liar| *liar == *robot.name.as_str()),
             })
         };
         self.robots.iter().enumerate().filter_map(&mut sample).collect()

@@ -170,9 +170,11 @@ impl<C> Robot<C> {
         }
     }
 
-    /// A batch was handed to the disk.
-    pub fn hands_over(&mut self, batch: u64, records: &[Record]) {
-        let closes = records.iter().any(|record| matches!(record, Record::EpochClosed { .. }));
+    /// A batch was handed to the disk by a core that writes this epoch.
+    pub fn hands_over(&mut self, writes: Option<u32>, batch: u64, records: &[Record]) {
+        // An epoch of a lost store that comes back is closed as well; that is not the frame which the SLAM left.
+        let left = |epoch: u32| writes == epoch.checked_add(1);
+        let closes = records.iter().any(|record| matches!(record, Record::EpochClosed { epoch } if left(*epoch)));
         if closes && self.new_frame.is_some() {
             self.new_frame = Some(NewFrame::Closing(batch));
         }

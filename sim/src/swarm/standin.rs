@@ -7,6 +7,7 @@ use merganser_protocol::agent::job::{AlignJob, Job, JobResult, Measured, SolveJo
 use merganser_protocol::estimate::joint::MapProblem;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
 use merganser_protocol::ids::Hash;
+use merganser_protocol::submap::Submap;
 use merganser_protocol::wire::fact::RefusalReason;
 use nalgebra::Vector6;
 use std::collections::BTreeMap;
@@ -26,14 +27,14 @@ impl StandIn {
         Self { options, seed, anchors: BTreeMap::new() }
     }
 
-    /// Does a job of the robot called `name`. `locate` says where the keyframe truly was that a pose in the SLAM's frame
-    /// names. Returns whether it lied.
-    pub fn run(&mut self, name: &str, job: Job, locate: impl FnOnce(&Se3) -> Option<Se3>) -> (JobResult, bool) {
+    /// Does a job of the robot called `name`. `locate` says where the keyframe truly was that a submap's anchor names.
+    /// Returns whether it lied.
+    pub fn run(&mut self, name: &str, job: Job, locate: impl FnOnce(&Submap) -> Option<Se3>) -> (JobResult, bool) {
         match job {
             Job::Describe(job) => {
-                let t_frame_anchor = job.submap.t_frame_anchor;
+                let t_world_anchor = locate(&job.submap);
                 let result = Job::Describe(job).run();
-                if let (JobResult::Described(described), Some(t_world_anchor)) = (&result, locate(&t_frame_anchor)) {
+                if let (JobResult::Described(described), Some(t_world_anchor)) = (&result, t_world_anchor) {
                     self.anchors.insert(Hash::of(&described.1.features.encode()), t_world_anchor);
                     self.anchors.insert(Hash::of(&described.1.keypoints.encode()), t_world_anchor);
                 }

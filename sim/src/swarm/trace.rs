@@ -106,6 +106,7 @@ fn records_digest(records: &[Record]) -> [u8; 32] {
             Record::Private { submap, bytes } => (format!("private {submap}"), &bytes[..]),
             Record::Fork { frame, proof } => (format!("fork {frame}"), &proof[1][..]),
             Record::EpochClosed { epoch } => (format!("closed {epoch}"), &[][..]),
+            Record::Replaced { below, submaps, blobs } => (format!("below {below}: {submaps:?} {blobs:?}"), &[][..]),
         };
         for part in [kind.as_bytes(), bytes] {
             hasher.update(&(part.len() as u64).to_le_bytes());

@@ -9,10 +9,10 @@ pub(super) const VERTICES_MAX: usize = 128;
 const NODES_MAX: u32 = 200_000;
 
 /// Set of vertices.
-pub(super) type Set = u128;
+pub(in crate::estimate) type Set = u128;
 
 /// The vertices of `set`, ascending.
-pub(super) fn vertices(mut set: Set) -> impl Iterator<Item = usize> {
+pub(in crate::estimate) fn vertices(mut set: Set) -> impl Iterator<Item = usize> {
     core::iter::from_fn(move || {
         (set != 0).then(|| {
             let v = set.trailing_zeros() as usize;
@@ -23,19 +23,19 @@ pub(super) fn vertices(mut set: Set) -> impl Iterator<Item = usize> {
 }
 
 /// The set of one vertex.
-pub(super) fn bit(v: usize) -> Set {
+pub(in crate::estimate) fn bit(v: usize) -> Set {
     1 << v
 }
 
 /// A maximum clique within `candidates`; `adjacency[v]` are v's neighbours (symmetric, without v).
-pub(super) fn maximum_clique(adjacency: &[Set], candidates: Set) -> Set {
+pub(in crate::estimate) fn maximum_clique(adjacency: &[Set], candidates: Set) -> Set {
     let mut search = Search { adjacency, best: 0, nodes_left: NODES_MAX };
     search.expand(0, candidates);
     search.best
 }
 
 /// A largest clique with vertex `v`, searched with a share of the nodes only: one is asked of every vertex.
-pub(super) fn largest_with(adjacency: &[Set], v: usize) -> Set {
+pub(in crate::estimate) fn largest_with(adjacency: &[Set], v: usize) -> Set {
     let mut search = Search { adjacency, best: 0, nodes_left: NODES_MAX / VERTICES_MAX as u32 };
     search.expand(bit(v), adjacency[v]);
     search.best

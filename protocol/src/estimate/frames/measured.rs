@@ -33,7 +33,7 @@ pub(super) struct Measured<'a, const N: usize, G> {
 }
 
 /// Log-spaced from 1 to `largest`.
-pub(super) fn scales_to(largest: f64) -> [f64; SCALES] {
+pub(in crate::estimate) fn scales_to(largest: f64) -> [f64; SCALES] {
     let step = 1.0 / (SCALES - 1) as f64;
     core::array::from_fn(|k| pow(largest, k as f64 * step))
 }

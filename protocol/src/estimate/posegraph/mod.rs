@@ -9,8 +9,6 @@ pub mod robust;
 pub mod solve;
 
 #[cfg(test)]
-mod robust_tests;
-#[cfg(test)]
 mod tests;
 
 use super::chordal::{ChordalEdge, ChordalGraph};

@@ -13,7 +13,7 @@ mod run;
 mod tests;
 
 pub use field::Case;
-pub use run::{Outcome, measure};
+pub use run::{Outcome, Shared, measure, share};
 
 use crate::bar::progress_bar;
 use clap::Args;

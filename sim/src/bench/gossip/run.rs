@@ -1,6 +1,6 @@
 //! One swarm from the start until all sets are equal.
 
-use super::field::{Field, TICK, World};
+use super::field::{Field, Layout, TICK, World};
 use super::policy::{Gossip, Policy};
 use super::radio::Radio;
 use crate::dice::Dice;
@@ -11,12 +11,12 @@ use ed25519_dalek::SigningKey;
 use merganser_protocol::config::GossipConfig;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
 use merganser_protocol::gossip::{Answer, Step};
-use merganser_protocol::ids::{Hash, Name, RobotId};
+use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId};
 use merganser_protocol::replica::{Ingested, Replica};
 use merganser_protocol::time::{Instant, Stamp};
 use merganser_protocol::wire::fact::{ScaleKind, SubmapFact};
 use merganser_protocol::wire::messages::Message;
-use merganser_protocol::wire::{Delta, Fact, HaveRoot, HaveVector};
+use merganser_protocol::wire::{Delta, Entry, EntryContent, Fact, HaveRoot, HaveVector};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use std::collections::BTreeSet;
@@ -27,6 +27,8 @@ use std::rc::Rc;
 const ANSWER_SECS: f64 = 2.0;
 /// Time that a steady swarm is given after it became equal, before it is measured.
 const SETTLE_SECS: f64 = 60.0;
+/// Between two entries that a robot shares, s: a tenth of what its radio can send.
+const SHARE_SECS: f64 = 0.08;
 /// The log's epoch.
 const EPOCH: u32 = 200_000_000;
 
@@ -94,9 +96,51 @@ pub fn measure(world: &World, policy: Policy, seed: u64) -> anyhow::Result<Outco
     Ok(swarm.outcome(world, policy, seed))
 }
 
+/// What it cost that all robots hold what each had.
+pub struct Shared {
+    /// Bytes of entries sent.
+    pub data: usize,
+    /// All other bytes sent.
+    pub control: usize,
+    /// When all sets were equal, s.
+    pub equal_after: Option<f64>,
+    /// What each robot holds.
+    pub replicas: Vec<Replica>,
+}
+
+/// Robots in reach of one another, each with payloads of a kind of their own, tell one another.
+///
+/// # Errors
+/// A payload that no entry can hold.
+pub fn share(payloads: Vec<Vec<Vec<u8>>>, kind: u8, loss: f64, seed: u64) -> anyhow::Result<Shared> {
+    let world = World {
+        name: "share",
+        robots: payloads.len(),
+        loss,
+        layout: Layout::Mesh,
+        facts: 0,
+        fact_every_secs: 0.0,
+        heal_at: 0.0,
+        until: 600.0,
+    };
+    let mut swarm = Swarm::new(&world, Policy::Ours, seed)?;
+    for (k, payloads) in payloads.into_iter().enumerate() {
+        for (n, payload) in payloads.into_iter().enumerate() {
+            let at = Instant::ZERO.after(Duration::from_secs_f64(TICK + SHARE_SECS * n as f64));
+            swarm.queue.push(at, Event::Share(k, kind, payload));
+            swarm.unwritten += 1;
+        }
+    }
+    swarm.run()?;
+    let Swarm { data, control, equal_at, nodes, .. } = swarm;
+    let replicas = nodes.into_iter().map(|node| node.replica).collect();
+    Ok(Shared { data, control, equal_after: equal_at.map(Instant::as_secs_f64), replicas })
+}
+
 enum Event {
     Tick,
     Write(usize),
+    Share(usize, u8, Vec<u8>),
     Wake(usize),
     Have { to: usize, from: usize, have: HaveRoot },
     Facts { to: usize, entry: Rc<Vec<u8>> },
@@ -129,6 +173,8 @@ struct Swarm<'a> {
     needed: usize,
     equal_at: Option<Instant>,
     settled: Option<(Instant, usize)>,
+    /// Payloads still to be shared.
+    unwritten: usize,
 }
 
 impl<'a> Swarm<'a> {
@@ -167,6 +213,7 @@ impl<'a> Swarm<'a> {
             needed: 0,
             equal_at: None,
             settled: None,
+            unwritten: 0,
         })
     }
 
@@ -204,6 +251,10 @@ impl<'a> Swarm<'a> {
                     let next = self.dice.exponential(self.world.fact_every_secs);
                     self.queue.push(now.after(Duration::from_secs_f64(next)), Event::Write(k));
                 }
+            }
+            Event::Share(k, kind, payload) => {
+                self.unwritten -= 1;
+                self.write_payload(now, k, kind, payload)?;
             }
             Event::Wake(k) => {
                 if self.nodes[k].wake == now {
@@ -270,6 +321,27 @@ impl<'a> Swarm<'a> {
         let fact = fact(node.facts)?;
         node.facts += 1;
         let entry = node.replica.append(&node.key, EPOCH, &fact).context("own fact")?;
+        self.publish(now, k, &entry);
+        Ok(())
+    }
+
+    /// One more entry of robot `k`, of a kind that only it knows.
+    fn write_payload(&mut self, now: Instant, k: usize, kind: u8, payload: Vec<u8>) -> anyhow::Result<()> {
+        let node = &mut self.nodes[k];
+        let frame = FrameId { robot: node.robot, epoch: EPOCH };
+        let seq = node.replica.next_seq(frame);
+        let last = seq.checked_sub(1).and_then(|last| node.replica.entry(EntryId { frame, seq: last }));
+        let previous = last.map_or_else(Hash::default, |last| last.hash());
+        let id = EntryId { frame, seq };
+        let content = EntryContent { swarm: node.replica.swarm(), id, kind, floor: 0, previous, payload };
+        let entry = Entry::sign(&node.key, content)?;
+        node.replica.ingest(&entry.encode())?;
+        self.publish(now, k, &entry);
+        Ok(())
+    }
+
+    fn publish(&mut self, now: Instant, k: usize, entry: &Entry) {
+        let node = &mut self.nodes[k];
         node.replica.mark_durable(entry.id());
         node.gossip.on_news(now, 1);
         let bytes = Rc::new(entry.encode());
@@ -282,7 +354,6 @@ impl<'a> Swarm<'a> {
         }
         self.equal_at = None;
         self.schedule(now, k);
-        Ok(())
     }
 
     fn act(&mut self, now: Instant, k: usize) {
@@ -373,7 +444,7 @@ impl<'a> Swarm<'a> {
     /// Notes when all sets have become equal.
     fn compare(&mut self, now: Instant) {
         let digest = self.nodes[0].replica.count();
-        let writing = now.as_secs_f64() < self.world.heal_at;
+        let writing = now.as_secs_f64() < self.world.heal_at || self.unwritten > 0;
         if !writing
             && self.equal_at.is_none()
             && self.nodes.iter().all(|node| node.replica.count() == digest)

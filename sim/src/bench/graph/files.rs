@@ -3,6 +3,7 @@
 use anyhow::{Context, bail};
 use merganser_protocol::estimate::posegraph::PoseGraph;
 use merganser_protocol::estimate::posegraph::g2o::Parser;
+use merganser_protocol::geometry::Se3;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -32,6 +33,25 @@ impl Source {
         let mut parser = Parser::default();
         read_into(&mut parser, path, |line| line)?;
         Ok(parser.finish())
+    }
+
+    /// Where the robots truly were, where a file tells (Kollagen's `*_GT.tum` beside each robot's graph, a line a pose).
+    pub(super) fn truth(&self) -> anyhow::Result<BTreeMap<u64, Se3>> {
+        let mut out = BTreeMap::new();
+        for (robot, path) in (0..).zip(self.files.iter().filter(|_| self.closures.is_some())) {
+            let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy().into_owned();
+            let Ok(text) = std::fs::read_to_string(path.with_file_name(format!("{name}_GT.tum"))) else { continue };
+            for (k, line) in text.lines().filter(|line| !line.starts_with('#')).enumerate() {
+                let numbers: Result<Vec<f64>, _> = line.split_whitespace().skip(1).map(str::parse).collect();
+                let pose = numbers.ok().and_then(|n| {
+                    let [x, y, z, rotation @ ..] = n.as_slice() else { return None };
+                    Se3::from_xyzw(rotation.try_into().ok()?, [*x, *y, *z])
+                });
+                let pose = pose.with_context(|| format!("{name}_GT.tum: line {} is no pose", k + 1))?;
+                out.insert(((u64::from(b'a') + robot) << 56) | k as u64, pose);
+            }
+        }
+        Ok(out)
     }
 
     /// Reads all robots' files.

@@ -3,6 +3,7 @@
 use crate::bench::cpu::thread_seconds;
 use merganser_protocol::estimate::posegraph::PoseGraph;
 use merganser_protocol::estimate::posegraph::solve::{ChordalOutcome, Start};
+use merganser_protocol::geometry::Se3;
 
 /// Iterations after which a minimisation gives up.
 const ITERATIONS_MAX: usize = 100;
@@ -22,6 +23,8 @@ pub(super) struct Measured {
     pub(super) chordal_s: f64,
     /// χ² from the certified minimum: the same minimum, if the relaxed start was good enough.
     pub(super) chi2_certified: f64,
+    /// The poses at that minimum.
+    pub(super) values: Vec<Se3>,
     /// All covariances relative to the first pose, processor s.
     pub(super) marginals_s: f64,
 }
@@ -46,6 +49,7 @@ pub(super) fn measure(graph: &PoseGraph, repeats: u8) -> anyhow::Result<Measured
         chordal,
         chordal_s,
         chi2_certified,
+        values: solved.values,
         marginals_s,
     })
 }

@@ -1,8 +1,12 @@
 //! The joint estimate's solver on benchmark graphs: minima, certificates, covariances and time, beside GTSAM.
 
+mod ate;
 mod files;
+mod kimera;
 mod measure;
 mod peer;
+mod peer_marginals;
+mod peer_robust;
 mod scale;
 mod spoil;
 mod swarm;
@@ -18,20 +22,24 @@ use std::path::PathBuf;
 pub struct GraphBench {
     /// Folder of g2o graphs, searched through; a folder of robots' files is one graph. Certified optima come from the
     /// optima.csv in it
-    #[arg(long, value_name = "DIR", required_unless_present = "scale")]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["scale", "kimera"])]
     pub data: Option<PathBuf>,
     /// Instead of files, a swarm of so many robots and anchors each, which then grows anchor by anchor: batch solve,
     /// covariances, single updates, memory. Exit code 1 if the grown estimate is not that of a batch solve
     #[arg(long, value_name = "ROBOTSxANCHORS", conflicts_with_all = ["data", "spoil", "peer_python"])]
     pub scale: Option<scale::Size>,
+    /// Instead, a folder of Kimera-Multi's measurement tables: what is used of their closures beside the weights that
+    /// are recorded in them, and where the two differ most. Exit code 1 if the robots do not share one frame
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["data", "scale", "spoil", "peer_python"])]
+    pub kimera: Option<PathBuf>,
     /// Only graphs whose name contains this
     #[arg(long, value_name = "STR", default_value = "")]
     pub filter: String,
-    /// Measure GTSAM on the same graphs, in this Python interpreter
+    /// Measure GTSAM on the same graphs, in this Python interpreter; with --spoil, its GNC and PCM
     #[arg(long, value_name = "PYTHON")]
     pub peer_python: Option<PathBuf>,
     /// Replace this share of the closures between robots by random ones, %, and solve robustly instead
-    #[arg(long, value_name = "PERCENT", conflicts_with = "peer_python", value_parser = clap::value_parser!(u32).range(0..=99))]
+    #[arg(long, value_name = "PERCENT", value_parser = clap::value_parser!(u32).range(0..=99))]
     pub spoil: Option<u32>,
     /// The seed that the random closures, or the swarm, are drawn from
     #[arg(long, default_value_t = 1)]
@@ -51,6 +59,11 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
         write!(std::io::stdout().lock(), "{text}")?;
         return Ok(is_good);
     }
+    if let Some(folder) = &options.kimera {
+        let (text, is_good) = kimera::run(folder)?;
+        write!(std::io::stdout().lock(), "{text}")?;
+        return Ok(is_good);
+    }
     let Some(data) = &options.data else { anyhow::bail!("give --data or --scale") };
     let optima = files::optima(data)?;
     let sources = files::find(data, &optima, &options.filter)?;
@@ -58,7 +71,7 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
     if let Some(percent) = options.spoil {
         let mut rows = Vec::new();
         for source in &sources {
-            rows.extend(spoil::measure(source, percent, options.seed)?);
+            rows.extend(spoil::measure(source, percent, options.seed, options.peer_python.as_deref())?);
             bar.inc(1);
         }
         bar.finish_and_clear();
@@ -77,8 +90,13 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
             Some((python, file)) => Some(peer::measure(python, file, options.repeats)?),
             None => None,
         };
+        let is_small = graph.poses.len() <= peer_marginals::GRAPH_POSES_MAX && !graph.planar;
+        let marginals = match options.peer_python.as_deref().filter(|_| is_small && !isotropic) {
+            Some(python) => Some(peer_marginals::difference(python, &graph, &measured.values)?),
+            None => None,
+        };
         let (name, optimum) = (source.name.clone(), optima.get(&source.name).copied());
-        rows.push(table::Row { name, optimum, isotropic, measured, peer });
+        rows.push(table::Row { name, optimum, isotropic, measured, peer, marginals });
         bar.inc(1);
     }
     bar.finish_and_clear();

@@ -2,8 +2,9 @@
 
 use anyhow::{Context, bail};
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Output};
 
 const SCRIPT: &str = include_str!("../../../bench/peer_graph.py");
 
@@ -22,17 +23,26 @@ pub(super) struct Peer {
 /// # Errors
 /// An interpreter without GTSAM, or output that cannot be read.
 pub(super) fn measure(python: &Path, file: &Path, repeats: u8) -> anyhow::Result<Peer> {
-    let output = Command::new(python)
-        .args(["-c", SCRIPT])
-        .arg(file)
-        .arg(repeats.to_string())
-        .output()
-        .with_context(|| format!("{}: no Python interpreter starts there", python.display()))?;
+    let output = Command::new(python).args(["-c", SCRIPT]).arg(file).arg(repeats.to_string()).output();
+    json_line(python, file, output)
+}
+
+/// What a peer's script printed last.
+///
+/// # Errors
+/// An interpreter that did not start, a script that failed, or output that cannot be read.
+pub(super) fn json_line<T: DeserializeOwned>(
+    python: &Path,
+    file: &Path,
+    output: std::io::Result<Output>,
+) -> anyhow::Result<T> {
+    let output = output.with_context(|| format!("{}: no Python interpreter starts there", python.display()))?;
     if !output.status.success() {
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         bail!("peer on {}: {}", file.display(), said.lines().last().unwrap_or("no reason given"));
     }
     let text = String::from_utf8_lossy(&output.stdout);
     let line = text.lines().rev().find(|line| line.starts_with('{')).context("the peer printed no result")?;
-    serde_json::from_str(line).with_context(|| format!("the peer's {line:?}"))
+    let shown: String = line.chars().take(80).collect();
+    serde_json::from_str(line).with_context(|| format!("the peer's {shown:?}"))
 }

@@ -1,18 +1,21 @@
 //! Multi-robot graphs whose loop closures between robots are partly replaced by random ones, solved as a swarm would:
 //! which closures are used, and what that does to the poses.
 
+use super::ate::{anees, ate};
 use super::files::Source;
+use super::peer_robust;
 use crate::bench::cpu::thread_seconds;
 use merganser_protocol::config::EstimateConfig;
 use merganser_protocol::estimate::posegraph::PoseGraph;
 use merganser_protocol::estimate::posegraph::robust::{Verdict, robot_of};
 use merganser_protocol::estimate::posegraph::solve::Start;
 use merganser_protocol::geometry::Se3;
-use nalgebra::{Matrix3, Vector3, Vector6};
+use nalgebra::{Vector3, Vector6};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::path::Path;
 
 const ITERATIONS_MAX: usize = 100;
 
@@ -22,13 +25,22 @@ pub(super) struct Spoiled {
     robots: usize,
     truths: usize,
     lies: usize,
-    used_truths: usize,
-    used_lies: usize,
     /// Components the robots ended in.
     parts: usize,
-    /// RMS distance of poses from those of the unspoiled graph: ours, and of the solution told which are true, m.
-    ate: f64,
+    /// RMS distance of poses from those of the unspoiled graph, of the solution told which are true, m.
     ate_told: f64,
+    /// Normalised error of our poses against the truth by degrees of freedom, where the truth is known.
+    anees: Option<f64>,
+    /// Ours, then the peers'.
+    answers: Vec<Answer>,
+}
+
+/// What a solver made of it.
+struct Answer {
+    name: String,
+    used_truths: usize,
+    used_lies: usize,
+    ate: f64,
     cpu_s: f64,
 }
 
@@ -36,7 +48,12 @@ pub(super) struct Spoiled {
 ///
 /// # Errors
 /// A graph that cannot be solved even unspoiled.
-pub(super) fn measure(source: &Source, percent: u32, seed: u64) -> anyhow::Result<Option<Spoiled>> {
+pub(super) fn measure(
+    source: &Source,
+    percent: u32,
+    seed: u64,
+    python: Option<&Path>,
+) -> anyhow::Result<Option<Spoiled>> {
     let clean = source.read_robots()?;
     let between = |graph: &PoseGraph, k: usize| {
         let m = &graph.measurements[k];
@@ -67,22 +84,30 @@ pub(super) fn measure(source: &Source, percent: u32, seed: u64) -> anyhow::Resul
     let start = thread_seconds();
     let out = graph.solve_robustly(&EstimateConfig { iterations_max: ITERATIONS_MAX, ..EstimateConfig::default() });
     let cpu_s = thread_seconds() - start;
-    let used = |lie: bool| {
-        let counts = |&&k: &&usize| lies[k] == lie && matches!(out.verdicts[k], Verdict::Used(_));
-        closures.iter().filter(counts).count()
+    let answer = |name: String, used: &dyn Fn(usize) -> bool, ate: f64, cpu_s: f64| {
+        let count = |lie: bool| closures.iter().filter(|&&k| lies[k] == lie && used(k)).count();
+        Answer { name, used_truths: count(false), used_lies: count(true), ate, cpu_s }
     };
     let all = out.components.iter().max_by_key(|c| c.len()).cloned().unwrap_or_default();
+    let is_used = |k: usize| matches!(out.verdicts[k], Verdict::Used(_));
+    let mut answers = vec![answer("merganser".to_owned(), &is_used, ate(&reference, &all), cpu_s)];
+    if let Some(python) = python {
+        for peer in peer_robust::measure(python, &graph)? {
+            let used = |k: usize| peer.used.binary_search(&k).is_ok();
+            let ate = ate(&reference, &peer.poses());
+            answers.push(answer(peer.name.clone(), &used, ate, peer.cpu_s));
+        }
+    }
+    let truth = source.truth()?;
     Ok(Some(Spoiled {
         name: source.name.clone(),
         robots: clean.poses.keys().map(|&id| robot_of(id)).collect::<std::collections::BTreeSet<_>>().len(),
         truths: closures.iter().filter(|&&k| !lies[k]).count(),
         lies: closures.iter().filter(|&&k| lies[k]).count(),
-        used_truths: used(false),
-        used_lies: used(true),
         parts: out.components.len(),
-        ate: ate(&reference, &all),
         ate_told,
-        cpu_s,
+        anees: if truth.is_empty() { None } else { anees(&truth, &out.marginals()) },
+        answers,
     }))
 }
 
@@ -129,33 +154,18 @@ fn solved(graph: &PoseGraph) -> anyhow::Result<BTreeMap<u64, Se3>> {
     Ok(graph.poses.keys().copied().zip(values).collect())
 }
 
-/// RMS distance of positions after the best rigid alignment.
-fn ate(reference: &BTreeMap<u64, Se3>, found: &BTreeMap<u64, Se3>) -> f64 {
-    let pairs: Vec<(Vector3<f64>, Vector3<f64>)> =
-        found.iter().filter_map(|(id, t)| Some((reference.get(id)?.translation, t.translation))).collect();
-    let n = pairs.len().max(1) as f64;
-    let (a, b) =
-        (pairs.iter().map(|p| p.0).sum::<Vector3<f64>>() / n, pairs.iter().map(|p| p.1).sum::<Vector3<f64>>() / n);
-    let cross: Matrix3<f64> = pairs.iter().map(|(x, y)| (x - a) * (y - b).transpose()).sum();
-    let svd = cross.svd(true, true);
-    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else { return f64::NAN };
-    let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
-    let rotation = u * flip * v_t;
-    (pairs.iter().map(|(x, y)| (x - a - rotation * (y - b)).norm_squared()).sum::<f64>() / n).sqrt()
-}
-
 impl Spoiled {
     /// Whether what was used is nearly all true and nearly all that is, and the poses are as if it had been told.
     pub(super) fn is_good(&self) -> bool {
-        self.precision() >= 0.99 && self.recall() >= 0.95 && self.parts == 1
+        self.answers.first().is_some_and(|ours| {
+            ours.precision() >= 0.99 && ours.used_truths as f64 >= 0.95 * self.truths as f64 && self.parts == 1
+        })
     }
+}
 
+impl Answer {
     fn precision(&self) -> f64 {
         self.used_truths as f64 / (self.used_truths + self.used_lies).max(1) as f64
-    }
-
-    fn recall(&self) -> f64 {
-        self.used_truths as f64 / self.truths.max(1) as f64
     }
 }
 
@@ -163,26 +173,39 @@ impl Spoiled {
 pub(super) fn table(percent: u32, seed: u64, rows: &[Spoiled]) -> String {
     let mut text = format!(
         "{percent} % of the closures between robots replaced by random ones, seed {seed}\n\
-         {:<44} {:>6} {:>6} {:>6} {:>9} {:>9} {:>6} {:>9} {:>9} {:>9}\n",
-        "", "robots", "true", "false", "precision", "recall", "parts", "ATE m", "told m", "cpu ms"
+         {:<32} {:>6} {:>6} {:>6} {:>9} {:>6} {:>6}  {:<10} {:>9} {:>9} {:>9} {:>9}\n",
+        "", "robots", "true", "false", "told m", "parts", "ANEES", "", "precision", "recall", "ATE m", "cpu ms"
     );
     for row in rows {
-        let skip = row.name.chars().count().saturating_sub(44);
-        let _ = writeln!(
-            text,
-            "{:<44} {:>6} {:>6} {:>6} {:>9.4} {:>9.4} {:>6} {:>9.4} {:>9.4} {:>9.0}",
-            row.name.chars().skip(skip).collect::<String>(),
-            row.robots,
-            row.truths,
-            row.lies,
-            row.precision(),
-            row.recall(),
-            row.parts,
-            row.ate,
-            row.ate_told,
-            1e3 * row.cpu_s
-        );
+        let skip = row.name.chars().count().saturating_sub(32);
+        for (k, answer) in row.answers.iter().enumerate() {
+            if k == 0 {
+                let _ = write!(
+                    text,
+                    "{:<32} {:>6} {:>6} {:>6} {:>9.4} {:>6} {:>6}",
+                    row.name.chars().skip(skip).collect::<String>(),
+                    row.robots,
+                    row.truths,
+                    row.lies,
+                    row.ate_told,
+                    row.parts,
+                    row.anees.map_or_else(|| "-".to_owned(), |x| format!("{x:.3}"))
+                );
+            } else {
+                let _ = write!(text, "{:<77}", "");
+            }
+            let _ = writeln!(
+                text,
+                "  {:<10} {:>9.4} {:>9.4} {:>9.4} {:>9.0}",
+                answer.name,
+                answer.precision(),
+                answer.used_truths as f64 / row.truths.max(1) as f64,
+                answer.ate,
+                1e3 * answer.cpu_s
+            );
+        }
     }
     text + "precision, recall: of closures between robots that count in the estimate; ATE: RMS distance of all poses from \
-            the unspoiled graph's; told: of the solution from the true closures alone\n"
+            the unspoiled graph's; told: of the solution from the true closures alone; ANEES: of our poses against the \
+            truth, where it is known, by degrees of freedom; peers start where PCM lays the robots out\n"
 }

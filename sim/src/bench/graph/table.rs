@@ -7,6 +7,9 @@ use std::fmt::Write;
 /// How far above the known optimum a minimum may lie, as a share of it.
 const OPTIMUM_TOLERANCE: f64 = 1e-6;
 
+/// How far a covariance may be from the peer's.
+const MARGINALS_TOLERANCE: f64 = 1e-8;
+
 /// One graph.
 pub(super) struct Row {
     pub(super) name: String,
@@ -15,13 +18,19 @@ pub(super) struct Row {
     pub(super) isotropic: bool,
     pub(super) measured: Measured,
     pub(super) peer: Option<Peer>,
+    /// By how much our covariances differ from the peer's, as a share of standard deviations, and of how many poses.
+    pub(super) marginals: Option<(f64, usize)>,
 }
 
 impl Row {
     /// Whether it converged, to the known optimum, and was certified.
     pub(super) fn is_good(&self) -> bool {
         let m = &self.measured;
-        m.converged && m.chordal.certificate.certified && self.excess().is_none_or(|excess| excess <= OPTIMUM_TOLERANCE)
+        let covariances = self.marginals.is_none_or(|(difference, _)| difference <= MARGINALS_TOLERANCE);
+        m.converged
+            && covariances
+            && m.chordal.certificate.certified
+            && self.excess().is_none_or(|excess| excess <= OPTIMUM_TOLERANCE)
     }
 
     /// By what share SE-Sync's cost lies above the known optimum.
@@ -81,6 +90,15 @@ pub(super) fn table(rows: &[Row]) -> String {
             ),
             None => writeln!(text, " {:>16} {:>9} {:>7} {:>10.1}", "-", "-", "-", 1e3 * m.marginals_s),
         };
+    }
+    for row in rows {
+        if let Some((difference, poses)) = row.marginals {
+            let _ = writeln!(
+                text,
+                "{:<40} covariances of {poses} poses are GTSAM's to {difference:.1e} of their standard deviations",
+                tail(&row.name)
+            );
+        }
     }
     text + "F/opt: against the certified optimum of optima.csv; λ_min: smallest eigenvalue of the certificate; cpu: thread \
             time, start, factor and certificate included; ratio: the peer's time over ours; GTSAM starts at the file's \

@@ -1,0 +1,245 @@
+//! What a condensed log says is what it said before, never surer.
+
+use super::condensing::{GONE_IN_A_ROW_MAX, Shorter, shorten};
+use super::knowledge::{Knowledge, Known};
+use crate::config::EstimateConfig;
+use crate::estimate::test_graphs::rng;
+use crate::estimate::test_world::World;
+use crate::estimate::{JointEstimate, solve_map};
+use crate::geometry::{PoseWithCovariance, Relative, Se3};
+use crate::ids::{EntryId, FrameId, Hash, SubmapId};
+use crate::replica::testing::signed;
+use crate::time::Stamp;
+use crate::wire::Entry;
+use crate::wire::fact::{
+    AlignmentFact, CondensedFact, Fact, RefusalReason, ScaleKind, SubmapFact, VerdictFact, VerdictOutcome,
+};
+use std::collections::BTreeMap;
+
+const ANCHORS: usize = 40;
+const ALIGNMENTS: usize = 5;
+const RUNS: u64 = 600;
+
+/// What the robots of a world wrote, by frame.
+struct Logs(BTreeMap<FrameId, Vec<Fact>>);
+
+impl Logs {
+    fn of(world: &World) -> Self {
+        let mut logs = BTreeMap::new();
+        for (frame, chain) in &world.problem.frames {
+            let submap = |(index, odometry): (usize, &PoseWithCovariance)| submap(index as u32, *odometry);
+            logs.insert(*frame, chain.odometry.iter().enumerate().map(submap).collect::<Vec<_>>());
+        }
+        let mut verdicts = Vec::new();
+        for stated in &world.problem.alignments {
+            let (i, j, t_i_j) = match stated.i < stated.j {
+                true => (stated.i, stated.j, stated.t_i_j),
+                false => (stated.j, stated.i, stated.t_i_j.inverse()),
+            };
+            let log = logs.get_mut(&i.frame).unwrap();
+            let alignment = EntryId { frame: i.frame, seq: log.len() as u32 };
+            let blobs = [Hash::default(); 2];
+            log.push(Fact::Alignment(AlignmentFact { i, j, t_i_j, sigma: 0.1, support: 20, log10_nfa: -9.0, blobs }));
+            let outcome = VerdictOutcome::Measured { t_i_j, sigma: 0.1, support: 20 };
+            verdicts.push((j.frame, Fact::Verdict(VerdictFact { alignment, outcome })));
+        }
+        verdicts.into_iter().for_each(|(frame, verdict)| logs.get_mut(&frame).unwrap().push(verdict));
+        Self(logs)
+    }
+
+    fn entries(&self, frame: FrameId) -> Vec<Entry> {
+        let facts = self.0[&frame].iter();
+        (0..).zip(facts).map(|(seq, fact)| entry(seq, 0, fact)).collect()
+    }
+
+    fn knowledge(&self) -> Knowledge {
+        let mut knowledge = Knowledge::default();
+        for (frame, facts) in &self.0 {
+            for (seq, fact) in (0..).zip(facts) {
+                // As peers read it.
+                let fact = Fact::from_payload(fact.kind(), &fact.to_payload().unwrap()).unwrap();
+                knowledge.absorb(EntryId { frame: *frame, seq }, fact);
+            }
+        }
+        knowledge
+    }
+
+    fn shorter(&self, frame: FrameId, knowledge: &Knowledge) -> Shorter {
+        shorten(frame, &self.entries(frame), knowledge).unwrap()
+    }
+
+    fn condensed(&self, knowledge: &Knowledge) -> (Knowledge, BTreeMap<EntryId, Fact>) {
+        let (mut condensed, mut held) = (Knowledge::default(), BTreeMap::new());
+        for (frame, facts) in &self.0 {
+            for (seq, part) in (facts.len() as u32..).zip(self.shorter(*frame, knowledge).parts) {
+                let fact = Fact::Condensed(part);
+                let fact = Fact::from_payload(fact.kind(), &fact.to_payload().unwrap()).unwrap();
+                condensed.absorb(EntryId { frame: *frame, seq }, fact.clone());
+                held.insert(EntryId { frame: *frame, seq }, fact);
+            }
+        }
+        (condensed, held)
+    }
+
+    fn solve(&self, knowledge: &Knowledge, own: FrameId, condensed: &BTreeMap<EntryId, Fact>) -> (JointEstimate, Gaps) {
+        let odometry = |known: &Known| {
+            let held_at = EntryId { seq: known.held_at, ..known.entry };
+            let fact = match condensed.get(&held_at) {
+                Some(Fact::Condensed(fact)) => {
+                    &fact.carried.iter().find(|one| one.seq == known.entry.seq).unwrap().fact
+                }
+                _ => &self.0[&known.entry.frame][known.entry.seq as usize],
+            };
+            if let Fact::Submap(fact) = fact { Some(fact.odometry) } else { None }
+        };
+        let question = knowledge.question(own, odometry);
+        (solve_map(&question.problem, &EstimateConfig::default()), question.gaps)
+    }
+}
+
+type Gaps = BTreeMap<FrameId, Vec<u32>>;
+
+fn entry(seq: u32, floor: u32, fact: &Fact) -> Entry {
+    signed(1, 4, seq, floor, if seq == 0 { Hash::default() } else { Hash::of(b"before") }, fact)
+}
+
+fn submap(index: u32, odometry: PoseWithCovariance) -> Fact {
+    Fact::Submap(SubmapFact {
+        index,
+        stamps: [Stamp(i64::from(index)), Stamp(i64::from(index) + 1)],
+        odometry,
+        extent: [1.0; 3],
+        summary: vec![],
+        keypoint_count: 1,
+        blob: Hash::of(&index.to_le_bytes()),
+        scale: ScaleKind::Metric,
+    })
+}
+
+fn world(seed: u64) -> (World, [FrameId; 2]) {
+    let mut rng = rng(seed);
+    let mut world = World::new(&mut rng, 2, ANCHORS, false);
+    world.align_all(&mut rng, ALIGNMENTS, false);
+    let frames: Vec<FrameId> = world.frames.keys().copied().collect();
+    (world, [frames[0], frames[1]])
+}
+
+fn nees(estimate: &Relative, truth: &Se3) -> f64 {
+    let estimate = estimate.metric().unwrap();
+    estimate.covariance.mahalanobis_squared(&estimate.pose.local(truth))
+}
+
+#[test]
+fn the_estimate_of_a_condensed_log_is_honest() {
+    let (mut sums, mut count, mut anchors, mut anchor_count) = ([0.0; 2], 0, [0.0; 2], 0);
+    let (mut ratios, mut shifts) = (Vec::new(), Vec::new());
+    for seed in 0..RUNS {
+        let (world, [a, b]) = world(seed);
+        let logs = Logs::of(&world);
+        let knowledge = logs.knowledge();
+        let (condensed, held) = logs.condensed(&knowledge);
+        let (full, _) = logs.solve(&knowledge, a, &BTreeMap::new());
+        let (short, gaps) = logs.solve(&condensed, a, &held);
+        let (Some(x), Some(y)) = (full.frame(a, b), short.frame(a, b)) else { continue };
+        let truth = world.frame_truth(a, b).to_se3();
+        (sums[0], sums[1], count) = (sums[0] + nees(&x, &truth), sums[1] + nees(&y, &truth), count + 1);
+        // The last anchor of the other robot, wherever it is in the chain now.
+        let last = SubmapId { frame: b, index: ANCHORS as u32 - 1 };
+        let place = gaps[&b].binary_search(&last.index).unwrap() as u32;
+        let truth = (world.frames[&a].inverse() * world.anchor(last)).to_se3();
+        let (x, y) = (full.anchor(a, last).unwrap(), short.anchor(a, SubmapId { index: place, ..last }).unwrap());
+        (anchors[0], anchors[1]) = (anchors[0] + nees(&x, &truth), anchors[1] + nees(&y, &truth));
+        anchor_count += 1;
+        let (x, y) = (*x.metric().unwrap(), *y.metric().unwrap());
+        ratios.push(y.covariance.matrix().trace() / x.covariance.matrix().trace());
+        shifts.push(x.covariance.mahalanobis_squared(&x.pose.local(&y.pose)).sqrt());
+    }
+    ratios.sort_by(f64::total_cmp);
+    shifts.sort_by(f64::total_cmp);
+    let anees = [sums[0], sums[1], anchors[0], anchors[1]].map(|sum| sum / f64::from(count) / 6.0);
+    println!(
+        "{count} runs, ANEES/dof of frames {:.3} whole, {:.3} condensed; of anchors {:.3} whole, {:.3} condensed; \
+         covariance trace {:.4} to {:.4}, median {:.4}; shift median {:.3}, largest {:.3} sigma",
+        anees[0],
+        anees[1],
+        anees[2],
+        anees[3],
+        ratios[0],
+        ratios[ratios.len() - 1],
+        ratios[ratios.len() / 2],
+        shifts[shifts.len() / 2],
+        shifts[shifts.len() - 1]
+    );
+    assert!(count >= 300 && count == anchor_count, "{count}");
+    for anees in anees {
+        assert!((0.93..=1.07).contains(&anees), "{anees}");
+    }
+    assert!(ratios[0] > 0.99, "surer than before: {}", ratios[0]);
+    assert!(shifts[shifts.len() - 1] < 0.3, "{}", shifts[shifts.len() - 1]);
+}
+
+#[test]
+fn what_stays_is_what_is_tied_and_enough_of_the_rest() {
+    let (world, frames) = world(7);
+    let logs = Logs::of(&world);
+    let knowledge = logs.knowledge();
+    let tied = knowledge.tied_submaps();
+    for frame in frames {
+        let Shorter { parts, gone } = logs.shorter(frame, &knowledge);
+        let carried: Vec<_> = parts.iter().flat_map(|part| &part.carried).collect();
+        let kept: Vec<u32> = carried
+            .iter()
+            .filter_map(|one| if let Fact::Submap(submap) = &one.fact { Some(submap.index) } else { None })
+            .collect();
+        assert_eq!(kept.len() + gone.len(), ANCHORS);
+        assert!(gone.len() >= ANCHORS / 3, "{} gone", gone.len());
+        assert!(kept[0] == 0 && kept.contains(&(ANCHORS as u32 - 1)));
+        assert!(tied.iter().filter(|id| id.frame == frame).all(|id| kept.contains(&id.index)));
+        assert!(kept.windows(2).all(|two| two[1] - two[0] <= GONE_IN_A_ROW_MAX + 1), "{kept:?}");
+        let others = logs.0[&frame].len() - ANCHORS;
+        assert_eq!(carried.len() - kept.len(), others, "every other fact is carried");
+        // Each submap says which one it follows now.
+        let after: Vec<_> = carried.iter().filter(|one| one.fact.kind() == 1).map(|one| one.after).collect();
+        let expected: Vec<_> = std::iter::once(None).chain(kept.iter().copied().map(Some)).take(kept.len()).collect();
+        assert_eq!(after, expected);
+    }
+}
+
+#[test]
+fn condensing_again_thins_no_further_where_nothing_is_left_to_go() {
+    let (world, [a, _]) = world(9);
+    let logs = Logs::of(&world);
+    let knowledge = logs.knowledge();
+    let first = logs.shorter(a, &knowledge);
+    let again = |parts: &[CondensedFact]| {
+        let entries: Vec<Entry> =
+            (100..).zip(parts).map(|(seq, part)| entry(seq, 100, &Fact::Condensed(part.clone()))).collect();
+        shorten(a, &entries, &knowledge).unwrap()
+    };
+    let second = again(&first.parts);
+    assert!(second.gone.is_empty(), "{:?}", second.gone);
+    let facts = |shorter: &Shorter| shorter.parts.iter().flat_map(|part| part.carried.clone()).count();
+    assert_eq!(facts(&second), facts(&first));
+}
+
+#[test]
+fn what_cannot_be_read_is_not_condensed_and_idle_answers_go() {
+    let (world, [a, b]) = world(11);
+    let logs = Logs::of(&world);
+    let knowledge = logs.knowledge();
+    let mut entries = logs.entries(b);
+    let idle = |seq| VerdictFact {
+        alignment: EntryId { frame: a, seq },
+        outcome: VerdictOutcome::Refused(RefusalReason::TooFew),
+    };
+    let seq = entries.len() as u32;
+    entries.push(entry(seq, 0, &Fact::Verdict(idle(9_999))));
+    let shorter = shorten(b, &entries, &knowledge).unwrap();
+    let carried =
+        |shorter: &Shorter, seq| shorter.parts.iter().any(|part| part.carried.iter().any(|one| one.seq == seq));
+    assert!(!carried(&shorter, seq) && carried(&shorter, seq - 1));
+    // A gap in the chain of submaps.
+    let mut broken = entries.clone();
+    broken.remove(5);
+    assert!(shorten(b, &broken, &knowledge).is_none());
+}

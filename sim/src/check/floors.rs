@@ -1,0 +1,130 @@
+//! Nothing below a floor returns (DESIGN §8.4): once a robot's disk has dropped what a writer replaced, no entry below
+//! that place is put on it again, in no later run, and the robot offers none to others. A disk that was wiped, or that
+//! lost what it had confirmed, is excused.
+
+use super::{Check, Seen};
+use merganser_protocol::agent::io::{Output, Record};
+use merganser_protocol::ids::FrameId;
+use merganser_protocol::wire::{Entry, Message};
+use std::collections::BTreeMap;
+
+/// See the module.
+#[derive(Debug, Default)]
+pub struct Floors {
+    robots: BTreeMap<usize, Disk>,
+}
+
+#[derive(Debug, Default)]
+struct Disk {
+    floors: BTreeMap<FrameId, u32>,
+    /// Floors handed to the disk, by batch.
+    waiting: Vec<(u64, FrameId, u32)>,
+}
+
+impl Disk {
+    fn above(&self, frame: FrameId, seq: u32) -> Result<(), String> {
+        let floor = self.floors.get(&frame).copied().unwrap_or(0);
+        if seq < floor { Err(format!("entry {frame}:{seq} came back from below the floor {floor}")) } else { Ok(()) }
+    }
+
+    fn persist(&mut self, batch: u64, records: &[Record]) -> Result<(), String> {
+        for record in records {
+            match record {
+                Record::Entry { id, .. } => self.above(id.frame, id.seq)?,
+                Record::Replaced { below, .. } => self.waiting.push((batch, below.frame, below.seq)),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn offers(&self, bytes: &[u8]) -> Result<(), String> {
+        // Looking into each message is dear, and without floors there is nothing to find.
+        if self.floors.is_empty() {
+            return Ok(());
+        }
+        let entries = match Message::decode(bytes) {
+            Ok(Message::Facts(entries)) => entries,
+            Ok(Message::SyncReply(delta)) => delta.entries,
+            _ => return Ok(()),
+        };
+        let ids = entries.iter().filter_map(|entry| Entry::decode(&entry.0).ok()).map(|entry| entry.id());
+        ids.into_iter().try_for_each(|id| self.above(id.frame, id.seq))
+    }
+}
+
+impl Check for Floors {
+    fn name(&self) -> &'static str {
+        "nothing below a floor"
+    }
+
+    fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
+        let disk = self.robots.entry(robot).or_default();
+        let seen = match seen {
+            Seen::Output(Output::Persist { batch, records }) => disk.persist(*batch, records),
+            Seen::Output(Output::Publish { bytes, .. } | Output::Answer { bytes, .. }) => disk.offers(bytes),
+            Seen::Durable(batch) => {
+                let durable: Vec<_> = disk.waiting.extract_if(.., |(number, ..)| *number <= *batch).collect();
+                for (_, frame, seq) in durable {
+                    let floor = disk.floors.entry(frame).or_default();
+                    *floor = seq.max(*floor);
+                }
+                Ok(())
+            }
+            Seen::Died => {
+                disk.waiting.clear();
+                Ok(())
+            }
+            Seen::Wiped | Seen::Damaged => {
+                *disk = Disk::default();
+                Ok(())
+            }
+            _ => Ok(()),
+        };
+        seen.map_err(|what| format!("robot {robot}: {what}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use merganser_protocol::ids::{EntryId, RobotId};
+
+    const FRAME: FrameId = FrameId { robot: RobotId([1; 8]), epoch: 4 };
+
+    fn hand_over(check: &mut Floors, robot: usize, record: Record) -> Result<(), String> {
+        check.see(robot, &Seen::Output(&Output::Persist { batch: 1, records: vec![record] }))
+    }
+
+    fn entry(seq: u32) -> Record {
+        Record::Entry { id: EntryId { frame: FRAME, seq }, bytes: vec![] }
+    }
+
+    fn floor(seq: u32) -> Record {
+        Record::Replaced { below: EntryId { frame: FRAME, seq }, submaps: vec![], blobs: vec![] }
+    }
+
+    #[test]
+    fn an_entry_that_comes_back_from_below_is_seen() {
+        let mut check = Floors::default();
+        hand_over(&mut check, 0, floor(5)).unwrap();
+        assert!(hand_over(&mut check, 0, entry(4)).is_ok(), "not on disk yet");
+        check.see(0, &Seen::Durable(1)).unwrap();
+        assert!(hand_over(&mut check, 0, entry(5)).is_ok());
+        assert!(hand_over(&mut check, 0, entry(4)).is_err());
+        assert!(hand_over(&mut check, 1, entry(4)).is_ok(), "of another robot's disk nothing was said");
+        check.see(0, &Seen::Died).unwrap();
+        assert!(hand_over(&mut check, 0, entry(4)).is_err(), "no more after a restart");
+        check.see(0, &Seen::Wiped).unwrap();
+        assert!(hand_over(&mut check, 0, entry(4)).is_ok());
+    }
+
+    #[test]
+    fn a_floor_that_died_with_its_process_binds_nobody() {
+        let mut check = Floors::default();
+        hand_over(&mut check, 0, floor(5)).unwrap();
+        check.see(0, &Seen::Died).unwrap();
+        check.see(0, &Seen::Durable(1)).unwrap();
+        assert!(hand_over(&mut check, 0, entry(4)).is_ok());
+    }
+}
