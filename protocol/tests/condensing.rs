@@ -1,5 +1,5 @@
 //! A long log is replaced by what still counts of it, and nobody notices but by the bytes.
-#![allow(missing_docs)]
+#![allow(missing_docs, clippy::unwrap_used, reason = "a failed unwrap in a test is its report")]
 
 mod common;
 

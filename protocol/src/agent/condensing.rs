@@ -81,16 +81,23 @@ impl Agent {
     }
 }
 
+/// A submap in the chain of its frame.
+struct Step {
+    seq: u32,
+    after: Option<u32>,
+    submap: SubmapFact,
+}
+
 /// `None` if the log holds what this version cannot read, or its submaps do not form one chain.
 pub(super) fn shorten(frame: FrameId, entries: &[Entry], knowledge: &Knowledge) -> Option<Shorter> {
     let facts = facts(entries)?;
-    let mut chain: BTreeMap<u32, (u32, Option<u32>, SubmapFact)> = BTreeMap::new();
+    let mut chain: BTreeMap<u32, Step> = BTreeMap::new();
     let mut carried = Vec::new();
     for CarriedFact { seq, after, fact } in facts {
         match fact {
             Fact::Submap(submap) => {
                 // Of two that claim one index, the one written first counts.
-                chain.entry(submap.index).or_insert((seq, after, submap));
+                chain.entry(submap.index).or_insert(Step { seq, after, submap });
             }
             // To whom it was an answer, it is one no more.
             Fact::Verdict(verdict) if knowledge.alignment(verdict.alignment).is_none() => {}
@@ -100,7 +107,7 @@ pub(super) fn shorten(frame: FrameId, entries: &[Entry], knowledge: &Knowledge) 
     let stay = staying(frame, &chain, knowledge);
     let mut gone = Vec::new();
     let (mut before, mut last_kept, mut on_the_way) = (None, None, None);
-    for (index, (seq, after, mut submap)) in chain {
+    for (index, Step { seq, after, mut submap }) in chain {
         if after != before {
             return None;
         }
@@ -136,24 +143,24 @@ fn facts(entries: &[Entry]) -> Option<Vec<CarriedFact>> {
 }
 
 /// The submaps that stay: the first, the latest, all that anything is tied to, and enough of the others.
-fn staying(
-    frame: FrameId,
-    chain: &BTreeMap<u32, (u32, Option<u32>, SubmapFact)>,
-    knowledge: &Knowledge,
-) -> BTreeSet<u32> {
+fn staying(frame: FrameId, chain: &BTreeMap<u32, Step>, knowledge: &Knowledge) -> BTreeSet<u32> {
     let tied = knowledge.tied_submaps();
     let latest = chain.len().saturating_sub(LATEST_KEPT);
     let mut in_a_row = 0;
-    let stays = |(place, (&index, (_, after, _))): (usize, (&u32, &(u32, Option<u32>, SubmapFact)))| {
+    let mut kept = BTreeSet::new();
+    for (place, (&index, step)) in chain.iter().enumerate() {
         let tied = tied.contains(&SubmapId { frame, index });
         // A step that was compounded before stands for submaps that are gone already.
-        let gone_before = after.map_or(0, |after| index - after - 1);
+        let gone_before = step.after.map_or(0, |after| index - after - 1);
         let full = in_a_row + gone_before >= GONE_IN_A_ROW_MAX;
-        let stays = place == 0 || place >= latest || tied || full;
-        in_a_row = if stays { 0 } else { in_a_row + gone_before + 1 };
-        stays.then_some(index)
-    };
-    chain.iter().enumerate().filter_map(stays).collect()
+        if place == 0 || place >= latest || tied || full {
+            in_a_row = 0;
+            kept.insert(index);
+        } else {
+            in_a_row += gone_before + 1;
+        }
+    }
+    kept
 }
 
 /// As few condensed facts as hold them all.

@@ -177,7 +177,7 @@ mod tests {
             let t_i_j = Se3::new(So3::exp(&axis), Vector3::from_fn(|_, _| dice.range(-50.0, 50.0)));
             let information = Matrix6::from_diagonal(&Vector6::repeat(1.0 + (k % matrices) as f64));
             let (kappa, tau) = isotropic_weights(&information).unwrap();
-            let j = if k % 3 == 0 { k.saturating_sub(1000) } else { k + 1 };
+            let j = if k.is_multiple_of(3) { k.saturating_sub(1000) } else { k + 1 };
             Measurement { i: k, j, t_i_j, printed: t_i_j.rotation.matrix(), information, kappa, tau, line: 0 }
         };
         (0..count).map(one).collect()

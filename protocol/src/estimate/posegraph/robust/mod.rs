@@ -1,14 +1,14 @@
 //! Pose graphs with false measurements: decides which measurements count (MATH §5).
 //!
-//! The top byte of a pose's id tells its robot; a robot's own odometry is trusted ([`backbone`]). All other
+//! The top byte of a pose's id tells its robot; a robot's own odometry is trusted (`backbone`). All other
 //! measurements are loop closures, and the map decides which of them count, without ever starting from an estimate that
 //! a false one could bend:
 //!
-//! 1. Each robot's own closures that agree with its odometry show how much noise there really is ([`noise`]).
-//! 2. Pairs of robots go through the consensus of a swarm's frames ([`seed`]).
+//! 1. Each robot's own closures that agree with its odometry show how much noise there really is (`noise`).
+//! 2. Pairs of robots go through the consensus of a swarm's frames (`seed`).
 //! 3. Closures that the map contradicts are dropped and those that agree with it are let in, whoever left them out,
-//!    judged with the map's covariance ([`world`]); what now counts tells the noise better, and more may agree.
-//! 4. Parts of the map that few closures tie are merged where those agree through them ([`merge`]), and all begins
+//!    judged with the map's covariance (`world`); what now counts tells the noise better, and more may agree.
+//! 4. Parts of the map that few closures tie are merged where those agree through them (`merge`), and all begins
 //!    again at 3 until nothing changes.
 //!
 //! The map is then solved from the closures that count, with the information that the graph states.
