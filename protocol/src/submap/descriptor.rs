@@ -1,4 +1,4 @@
-//! From the [`rings`](super::rings) about a point to its descriptor: a fixed linear map takes the 60 numbers to 32 in
+//! From the `rings` about a point to its descriptor: a fixed linear map takes the 60 numbers to 32 in
 //! which two views of one place differ about equally along every axis and different places as much as can be (linear
 //! discriminant analysis with a ridge, learnt on ray-cast halls: no recorded data). A peer is sent 3 bits of each, 12
 //! bytes; one's own points keep 8. Measured on real submaps: of the right matches that 60 exact numbers find, 4 % are

@@ -3,7 +3,7 @@
 //! Where submaps overlap by a third, three to ten of their keypoints have a right match among a thousand wrong ones: no
 //! count of matches tells that from chance (MATH §4). But a pose can be *looked at*: of their points, so many would lie
 //! on my surface and none where I saw air. So the consensus' pose, if there is one, joins the poses that few matches
-//! suggest ([`hypotheses`](super::hypotheses)); each is judged by all keypoints.
+//! suggest (`hypotheses`); each is judged by all keypoints.
 //!
 //! **Score.** A confirmed point weighs ln(q/f): q is its chance under a right pose and f how often it is confirmed under
 //! the *other* poses of this very pair, so that ground on ground, which fits anywhere, weighs nothing. A contradicted
