@@ -7,7 +7,7 @@
 //!
 //! **Score.** A confirmed point weighs ln(q/f): q is its chance under a right pose and f how often it is confirmed under
 //! the *other* poses of this very pair, so that ground on ground, which fits anywhere, weighs nothing. A contradicted
-//! point costs [`CONTRADICTION_COST`], a match that agrees gains [`SUPPORT_GAIN`].
+//! point costs `CONTRADICTION_COST`, a match that agrees gains `SUPPORT_GAIN`.
 //!
 //! **Acceptance.** Score, share of keypoints near my surface, share of contradictions; and no other pose with nearly the
 //! same score that would itself pass, else the answer is *ambiguous*.
