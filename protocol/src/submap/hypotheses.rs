@@ -30,13 +30,24 @@ const POLISH_ROUNDS: usize = 2;
 pub fn hypotheses(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Vec<Pose> {
     let agreement = Agreement::of(theirs, mine, matches);
     let mut poses: Vec<Pose> = Vec::new();
+    let mut explained = vec![[0_u64; POSES_MAX.div_ceil(64)]; matches.len()];
+    let mut members: Vec<Pairing> = Vec::new();
     let middle = theirs.points.iter().sum::<Vector3<f64>>() / theirs.points.len().max(1) as f64;
     for (x, y) in agreement.ranked().into_iter().take(POSES_MAX) {
-        let mut members = vec![x as usize, y as usize];
-        members.extend(agreement.common(x as usize, y as usize));
-        let pose = polished(theirs, mine, &members.iter().map(|&k| matches[k]).collect::<Vec<_>>());
-        let Some(pose) = pose else { continue };
+        let (x, y) = (x as usize, y as usize);
+        // What an earlier pose explains leads to it again.
+        if explained[x].iter().zip(&explained[y]).any(|(a, b)| a & b != 0) {
+            continue;
+        }
+        members.clear();
+        members.extend([x, y].into_iter().chain(agreement.common(x, y)).map(|k| matches[k]));
+        let Some(pose) = polished(theirs, mine, &members) else { continue };
         if poses.iter().all(|other| pose.differs(other, &middle, SAME.0, SAME.1)) {
+            for k in [x, y].into_iter().chain(agreement.common(x, y)) {
+                if explains(&pose, theirs, mine, &matches[k]) {
+                    explained[k][poses.len() / 64] |= 1 << (poses.len() % 64);
+                }
+            }
             poses.push(pose);
         }
     }
@@ -114,15 +125,21 @@ fn agree(theirs: &Cloud, mine: &Cloud, first: &Pairing, second: &Pairing) -> boo
 /// The pose of the first two matches, then of all that are near it.
 fn polished(theirs: &Cloud, mine: &Cloud, members: &[Pairing]) -> Option<Pose> {
     let mut pose = least_squares(theirs, mine, members.get(..2)?)?;
+    let mut near = Vec::with_capacity(members.len());
     for _ in 0..POLISH_ROUNDS {
-        let near =
-            |p: &&Pairing| (pose.apply(&theirs.points[p.their as usize]) - mine.points[p.my as usize]).norm() <= POLISH;
-        let near: Vec<Pairing> = members.iter().filter(near).copied().collect();
+        near.clear();
+        near.extend(members.iter().filter(|p| explains(&pose, theirs, mine, p)).copied());
         if near.len() >= 2 {
             pose = least_squares(theirs, mine, &near)?;
         }
     }
     Some(pose)
+}
+
+/// Whether the pose takes a match's ends near to each other.
+fn explains(pose: &Pose, theirs: &Cloud, mine: &Cloud, pairing: &Pairing) -> bool {
+    let aside = pose.apply(&theirs.points[pairing.their as usize]) - mine.points[pairing.my as usize];
+    aside.norm_squared() <= POLISH * POLISH
 }
 
 /// The least-squares motion of points and normals (Horn's quaternion method).

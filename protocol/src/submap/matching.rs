@@ -9,6 +9,7 @@ use super::cloud::Index;
 use super::descriptor::{Code, DIMENSIONS};
 use super::features::{Features, Keypoints};
 use crate::geometry::Sim3;
+use crate::simd::wide;
 use nalgebra::Vector3;
 use pulp::Arch;
 
@@ -76,21 +77,23 @@ pub fn pair_up(theirs: &Keypoints, mine: &Features, my_points: &[Vector3<f64>]) 
     // For each feature the keypoint nearest to it so far.
     let mut likes = vec![(i32::MAX, u32::MAX); my_codes.len()];
     let mut all = Vec::with_capacity(COUNTERPARTS * theirs.len());
+    let mut shortlist: Vec<(i32, u32)> = Vec::with_capacity(my_codes.len());
     for (their, code) in (0u32..).zip(theirs.codes()) {
-        arch.dispatch(|| compare(&code, my_codes, &mut distances));
+        wide(arch, || compare(&code, my_codes, &mut distances));
         likes.iter_mut().zip(&distances).for_each(|(like, &distance)| {
             if distance < like.0 {
                 *like = (distance, their);
             }
         });
-        let mut shortlist: Vec<(i32, u32)> = distances.iter().copied().zip(0..).collect();
+        shortlist.clear();
+        shortlist.extend(distances.iter().copied().zip(0u32..));
         if shortlist.len() > SHORTLIST {
             shortlist.select_nth_unstable(SHORTLIST - 1);
             shortlist.truncate(SHORTLIST);
         }
         shortlist.sort_unstable();
         let begin = all.len();
-        for (distance, my) in shortlist {
+        for &(distance, my) in &shortlist {
             let near =
                 |other: &Pairing| (my_points[other.my as usize] - my_points[my as usize]).norm_squared() <= apart;
             if !all[begin..].iter().any(near) {
@@ -114,8 +117,8 @@ fn compare(code: &Code, codes: &[Code], distances: &mut [i32]) {
     for (distance, other) in distances.iter_mut().zip(codes) {
         let mut sum = 0;
         for k in 0..DIMENSIONS {
-            let difference = i32::from(i16::from(code[k]) - i16::from(other[k]));
-            sum += difference * difference;
+            let difference = i16::from(code[k]) - i16::from(other[k]);
+            sum += i32::from(difference) * i32::from(difference);
         }
         *distance = sum;
     }

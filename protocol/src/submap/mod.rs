@@ -19,6 +19,7 @@ pub mod features;
 mod grid;
 mod hypotheses;
 mod matching;
+mod near;
 mod odometry;
 pub mod refine;
 pub mod register;

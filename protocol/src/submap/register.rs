@@ -20,15 +20,24 @@ use super::scene::{Cloud, NEAR, Pose, Scene, Verdict};
 use super::surface::least_axis;
 use crate::align::{AlignError, Problem, SolverConfig, align};
 use crate::geometry::{Se3, So3};
+use core::ops::Range;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 use thiserror::Error;
 
-/// Keypoints that a pose is first judged by: an even cover.
-const GLANCED: usize = 96;
+/// Keypoints that a pose is first judged by: an even cover...
+const GLANCED: usize = 32;
+/// ...and, if it is among the first so many...
+const GLANCED_AGAIN: usize = 400;
+/// ...keypoints that it is judged by once more.
+const ROUGH: usize = 96;
 /// Poses that are polished.
 const POLISHED_MAX: usize = 60;
-/// Search radii while polishing, voxels.
-const RADII: [f32; 6] = [3.0, 2.5, 2.0, 2.0, 1.5, 1.5];
+/// Search radii while polishing on the first [`ROUGH`] keypoints, voxels...
+const RADII_ROUGH: [f32; 3] = [3.0, 2.5, 2.0];
+/// ...and on all.
+const RADII: [f32; 3] = [2.0, 1.5, 1.5];
+/// Poses that came this close to each other (voxels, rad) are one.
+const SAME: (f64, f64) = (0.5, 0.03);
 /// Poses that tell what chance does.
 const CHANCE_MAX: usize = 200;
 /// Chance of a keypoint's confirmation under a right pose.
@@ -226,61 +235,67 @@ struct Court<'a> {
     middle: Vector3<f64>,
     /// Poses that tell what chance does, and what they confirm.
     chance: Vec<(Pose, Vec<bool>)>,
+    /// By how many of them each point is confirmed.
+    often: Vec<u32>,
 }
 
 impl<'a> Court<'a> {
     fn new(theirs: &'a Cloud, mine: &'a Cloud, matches: &'a [Pairing], scene: Scene, poses: &[Pose]) -> Self {
         let middle = theirs.points.iter().sum::<Vector3<f64>>() / theirs.points.len().max(1) as f64;
-        let mut near = Vec::new();
         let stride = poses.len().div_ceil(CHANCE_MAX).max(1);
         let confirms = |pose: &Pose| -> Vec<bool> {
             let placed = theirs.points.iter().zip(&theirs.normals);
-            placed
-                .map(|(p, n)| scene.counterpart(&pose.apply(p), &(pose.rotation * n), NEAR, &mut near).is_some())
-                .collect()
+            placed.map(|(p, n)| scene.confirms(&pose.apply(p), &(pose.rotation * n))).collect()
         };
-        let mut confirms = confirms;
-        let chance = poses.iter().step_by(stride).map(|pose| (*pose, confirms(pose))).collect();
-        Self { theirs, mine, matches, scene, middle, chance }
+        let chance: Vec<_> = poses.iter().step_by(stride).map(|pose| (*pose, confirms(pose))).collect();
+        let often = often(theirs.points.len(), chance.iter().map(|(_, confirms)| confirms));
+        Self { theirs, mine, matches, scene, middle, chance, often }
     }
 
     /// The most promising poses, polished and judged, best first.
     fn judge(&self, poses: &[Pose]) -> Vec<Judged> {
-        let mut near = Vec::new();
         let mut glanced: Vec<(f64, usize)> =
-            poses.iter().enumerate().map(|(k, pose)| (-self.glance(pose, &mut near), k)).collect();
-        glanced.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        glanced.truncate(POLISHED_MAX);
-        let mut judged: Vec<Judged> =
-            glanced.into_iter().map(|(_, k)| self.close_look(self.polish(poses[k], &mut near), &mut near)).collect();
+            (0..poses.len()).map(|k| (self.glance(&poses[k], 0..GLANCED), k)).collect();
+        most(&mut glanced, GLANCED_AGAIN);
+        glanced.iter_mut().for_each(|(value, k)| *value += self.glance(&poses[*k], GLANCED..ROUGH));
+        most(&mut glanced, POLISHED_MAX);
+        let mut distinct: Vec<Pose> = Vec::new();
+        for (_, k) in glanced {
+            let pose = self.polish(poses[k], ROUGH, &RADII_ROUGH);
+            if distinct.iter().all(|other| pose.differs(other, &self.middle, SAME.0, SAME.1)) {
+                distinct.push(pose);
+            }
+        }
+        let all = self.theirs.points.len();
+        let look = |pose| self.close_look(self.polish(pose, all, &RADII));
+        let mut judged: Vec<Judged> = distinct.into_iter().map(look).collect();
         judged.sort_by(|a, b| b.score.total_cmp(&a.score));
         judged
     }
 
-    /// Confirmed points of an even few, less contradicted ones.
-    fn glance(&self, pose: &Pose, near: &mut Vec<u32>) -> f64 {
-        let first = self.theirs.points.iter().zip(&self.theirs.normals).take(GLANCED).enumerate();
+    /// Confirmed points of some, less contradicted ones.
+    fn glance(&self, pose: &Pose, some: Range<usize>) -> f64 {
+        let first = self.theirs.points.iter().zip(&self.theirs.normals).enumerate().take(some.end).skip(some.start);
         let count = self.chance.len() as f64;
-        let value = |(k, (p, n)): (usize, (&Vector3<f64>, &Vector3<f64>))| match self.scene.glance(
-            &pose.apply(p),
-            &(pose.rotation * n),
-            near,
-        ) {
-            Verdict::Confirmed => 1.0 - self.chance.iter().filter(|(_, confirms)| confirms[k]).count() as f64 / count,
+        let value = |(k, (p, n)): (usize, (&Vector3<f64>, &Vector3<f64>))| match self
+            .scene
+            .glance(&pose.apply(p), &(pose.rotation * n))
+        {
+            Verdict::Confirmed => 1.0 - f64::from(self.often[k]) / count,
             Verdict::Contradicted => -GLANCE_COST,
             Verdict::Unknown => 0.0,
         };
         first.map(value).sum()
     }
 
-    /// Point-to-plane steps on all keypoints.
-    fn polish(&self, mut pose: Pose, near: &mut Vec<u32>) -> Pose {
-        for radius in RADII {
-            let mut rows = Vec::with_capacity(self.theirs.points.len());
-            for (p, n) in self.theirs.points.iter().zip(&self.theirs.normals) {
+    /// Point-to-plane steps on the first keypoints.
+    fn polish(&self, mut pose: Pose, first: usize, radii: &[f32]) -> Pose {
+        let mut rows = Vec::with_capacity(first);
+        for &radius in radii {
+            rows.clear();
+            for (p, n) in self.theirs.points.iter().zip(&self.theirs.normals).take(first) {
                 let at = pose.apply(p);
-                if let Some(k) = self.scene.counterpart(&at, &(pose.rotation * n), radius, near) {
-                    let (point, normal) = self.scene.surface(k);
+                if let Some((point, normal)) = self.scene.counterpart(&at, &(pose.rotation * n), radius) {
                     rows.push((at, normal, normal.dot(&(at - point))));
                 }
             }
@@ -290,28 +305,23 @@ impl<'a> Court<'a> {
         pose
     }
 
-    fn close_look(&self, pose: Pose, near: &mut Vec<u32>) -> Judged {
+    fn close_look(&self, pose: Pose) -> Judged {
         let support = self.support(&pose);
         let mut judged =
             Judged { pose, confirmed: Vec::new(), contradicted: 0, support, fit: 0.0, surface: 0.0, score: 0.0 };
         let mut hits = 0;
         for (p, n) in self.theirs.points.iter().zip(&self.theirs.normals) {
-            let (verdict, hit) = self.scene.judge(&pose.apply(p), &(pose.rotation * n), near);
+            let (verdict, hit) = self.scene.judge(&pose.apply(p), &(pose.rotation * n));
             judged.confirmed.push(verdict == Verdict::Confirmed);
             judged.contradicted += usize::from(verdict == Verdict::Contradicted);
             hits += usize::from(hit);
         }
         judged.fit = f64::from(hits as u32) / self.theirs.points.len().max(1) as f64;
-        let others: Vec<&Vec<bool>> = self
-            .chance
-            .iter()
-            .filter(|(other, _)| pose.differs(other, &self.middle, RIVAL.0, RIVAL.1))
-            .map(|(_, confirms)| confirms)
-            .collect();
-        let weight = |k: usize| {
-            let often = others.iter().filter(|confirms| confirms[k]).count() as f64;
-            libm::log(CONFIRMED * (others.len() as f64 + 4.0) / (often + 1.0)).max(0.0)
-        };
+        let differs = |(other, _): &&(Pose, Vec<bool>)| pose.differs(other, &self.middle, RIVAL.0, RIVAL.1);
+        let others: Vec<&Vec<bool>> = self.chance.iter().filter(differs).map(|(_, confirms)| confirms).collect();
+        let often = often(judged.confirmed.len(), others.iter().copied());
+        let weight =
+            |k: usize| libm::log(CONFIRMED * (others.len() as f64 + 4.0) / (f64::from(often[k]) + 1.0)).max(0.0);
         let confirmed = judged.confirmed.iter().enumerate().filter(|(_, c)| **c);
         let surface = confirmed.map(|(k, _)| weight(k)).sum::<f64>() - CONTRADICTION_COST * judged.contradicted as f64;
         judged.surface = surface / POINTS_PER_MEASUREMENT;
@@ -327,10 +337,9 @@ impl Court<'_> {
         let spread: Matrix3<f64> = faces.map(|(_, n)| best.pose.rotation * n).map(|n| n * n.transpose()).sum();
         let upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].map(|at| spread[at]);
         let Some((axis, _)) = least_axis(&upper) else { return 0.0 };
-        let mut near = Vec::new();
         let surface = |by: &f64| {
             let translation = best.pose.translation + axis * *by;
-            self.close_look(Pose { translation, ..best.pose }, &mut near).surface
+            self.close_look(Pose { translation, ..best.pose }).surface
         };
         SLIDES.iter().map(surface).fold(0.0, f64::max)
     }
@@ -346,6 +355,21 @@ impl Court<'_> {
         support.dedup_by_key(|p| p.their);
         support
     }
+}
+
+/// The `count` of the highest value, falling.
+fn most(values: &mut Vec<(f64, usize)>, count: usize) {
+    values.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    values.truncate(count);
+}
+
+/// By how many poses each of `count` points is confirmed.
+fn often<'a>(count: usize, poses: impl Iterator<Item = &'a Vec<bool>>) -> Vec<u32> {
+    let mut often = vec![0; count];
+    for confirms in poses {
+        often.iter_mut().zip(confirms).for_each(|(often, &confirmed)| *often += u32::from(confirmed));
+    }
+    often
 }
 
 /// A robust Gauss–Newton step on (point, plane normal, distance) rows; `None` where they are too few.

@@ -8,6 +8,7 @@
 //! more than what lies sparsely, as things do in the near and the far of a LiDAR scan.
 
 use super::grid::{Grid, LANES, Lanes, bounds, cell_key};
+use crate::simd::wide;
 use core::f32::consts::TAU;
 use pulp::Arch;
 
@@ -96,8 +97,8 @@ pub fn describe_points(points: &[[f32; 3]], normals: &[[f32; 3]], chosen: &[u32]
         for &k in cell {
             let k = k as usize;
             let (p, n) = (&at[k], &normals[chosen[k] as usize]);
-            let near = arch.dispatch(|| sums(inner, p, n, &inner_hats));
-            let far = arch.dispatch(|| sums(outer, p, n, &outer_hats));
+            let near = wide(arch, || sums(inner, p, n, &inner_hats));
+            let far = wide(arch, || sums(outer, p, n, &outer_hats));
             let rings = numbers[k].chunks_exact_mut(SUMS).zip(near.iter().chain(&far)).enumerate();
             rings.for_each(|(ring, (numbers, sums))| finish(ring, sums, numbers));
         }

@@ -2,7 +2,7 @@
 //! nothing but air ([`Views`]). Built once per alignment and asked many times. Lengths are in voxels.
 
 use super::features::{Features, in_voxels};
-use super::grid::Grid;
+use super::near::{Near, Piece};
 use super::views::Views;
 use nalgebra::{Matrix3, Vector3};
 
@@ -33,8 +33,9 @@ impl Pose {
     /// Whether two poses place the points about `middle` differently: by more than `distance`, or turned by more than
     /// `angle` (rad).
     pub fn differs(&self, other: &Self, middle: &Vector3<f64>, distance: f64, angle: f64) -> bool {
-        let cos = ((self.rotation.transpose() * other.rotation).trace() - 1.0) / 2.0;
-        cos < libm::cos(angle) || (self.apply(middle) - other.apply(middle)).norm() > distance
+        // The cosine is (tr − 1) / 2; the trace of RᵀS is the sum of the products of their numbers.
+        (self.apply(middle) - other.apply(middle)).norm_squared() > distance * distance
+            || (self.rotation.dot(&other.rotation) - 1.0) / 2.0 < libm::cos(angle)
     }
 }
 
@@ -60,9 +61,7 @@ pub enum Verdict {
 
 /// The judge.
 pub struct Scene {
-    points: Vec<[f32; 3]>,
-    normals: Vec<[f32; 3]>,
-    grid: Grid,
+    surface: Near,
     views: Views,
 }
 
@@ -70,30 +69,35 @@ impl Scene {
     /// From one's own features.
     pub fn new(mine: &Features) -> Self {
         let (points, normals) = in_voxels(&mine.block);
-        let views = Views::new(mine, &points);
-        Self { grid: Grid::new(&points, NEAR), points, normals, views }
+        let pieces: Vec<Piece> = points.iter().zip(normals).map(|(&point, normal)| Piece { point, normal }).collect();
+        Self { surface: Near::new(&pieces), views: Views::new(mine, &points) }
     }
 
-    /// My point nearest to one of theirs at `at` with `normal`, within `radius` and facing the same way.
+    /// Position and normal of my point nearest to one of theirs at `at` with `normal`, within `radius` and facing the
+    /// same way.
     pub fn counterpart(
         &self,
         at: &Vector3<f64>,
         normal: &Vector3<f64>,
         radius: f32,
-        near: &mut Vec<u32>,
-    ) -> Option<usize> {
-        let n = single(normal);
-        self.nearest(at, radius, near, |k| dot(&self.normals[k], &n) >= NORMALS_COS_MIN)
+    ) -> Option<(Vector3<f64>, Vector3<f64>)> {
+        let found = self.facing(at, normal, radius)?;
+        Some((Vector3::from(found.point.map(f64::from)), Vector3::from(found.normal.map(f64::from))))
     }
 
-    /// Position and normal of one of my points.
-    pub fn surface(&self, k: usize) -> (Vector3<f64>, Vector3<f64>) {
-        (Vector3::from(self.points[k].map(f64::from)), Vector3::from(self.normals[k].map(f64::from)))
+    /// Whether a point of theirs at `at` with `normal` lies on my surface.
+    pub fn confirms(&self, at: &Vector3<f64>, normal: &Vector3<f64>) -> bool {
+        self.facing(at, normal, NEAR).is_some()
+    }
+
+    fn facing(&self, at: &Vector3<f64>, normal: &Vector3<f64>, radius: f32) -> Option<&Piece> {
+        let n = single(normal);
+        self.surface.nearest(&single(at), radius, |piece| dot(&piece.normal, &n) >= NORMALS_COS_MIN)
     }
 
     /// A first look at a point of theirs.
-    pub fn glance(&self, at: &Vector3<f64>, normal: &Vector3<f64>, near: &mut Vec<u32>) -> Verdict {
-        if self.counterpart(at, normal, NEAR, near).is_some() {
+    pub fn glance(&self, at: &Vector3<f64>, normal: &Vector3<f64>) -> Verdict {
+        if self.confirms(at, normal) {
             Verdict::Confirmed
         } else if self.views.looked_through(at) {
             Verdict::Contradicted
@@ -103,41 +107,20 @@ impl Scene {
     }
 
     /// A close look at a point of theirs, once a pose is polished; and whether any point of mine is near.
-    pub fn judge(&self, at: &Vector3<f64>, normal: &Vector3<f64>, near: &mut Vec<u32>) -> (Verdict, bool) {
+    pub fn judge(&self, at: &Vector3<f64>, normal: &Vector3<f64>) -> (Verdict, bool) {
         let (n, p) = (single(normal), single(at));
-        let faces = |k: usize| dot(&self.normals[k], &n) >= CLOSE_COS_MIN;
-        if let Some(k) = self.nearest(at, NEAR, near, faces) {
-            let aside = [0, 1, 2].map(|axis| p[axis] - self.points[k][axis]);
-            let lies = dot(&aside, &self.normals[k]).abs() <= CLOSE_PLANE_MAX;
+        if let Some(mine) = self.surface.nearest(&p, NEAR, |piece| dot(&piece.normal, &n) >= CLOSE_COS_MIN) {
+            let aside = [0, 1, 2].map(|axis| p[axis] - mine.point[axis]);
+            let lies = dot(&aside, &mine.normal).abs() <= CLOSE_PLANE_MAX;
             return (if lies { Verdict::Confirmed } else { Verdict::Unknown }, true);
         }
-        if self.nearest(at, NEAR, near, |_| true).is_some() {
+        if self.surface.nearest(&p, NEAR, |_| true).is_some() {
             (Verdict::Unknown, true)
         } else if self.views.looked_through(at) {
             (Verdict::Contradicted, false)
         } else {
             (Verdict::Unknown, false)
         }
-    }
-
-    fn nearest(
-        &self,
-        at: &Vector3<f64>,
-        radius: f32,
-        near: &mut Vec<u32>,
-        fits: impl Fn(usize) -> bool,
-    ) -> Option<usize> {
-        let p = single(at);
-        self.grid.around(&p, &p, radius, near);
-        let mut best = (radius * radius, None);
-        for &k in near.iter() {
-            let q = &self.points[k as usize];
-            let squared: f32 = (0..3).map(|axis| (q[axis] - p[axis]) * (q[axis] - p[axis])).sum();
-            if squared <= best.0 && fits(k as usize) {
-                best = (squared, Some(k as usize));
-            }
-        }
-        best.1
     }
 }
 

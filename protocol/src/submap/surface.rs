@@ -2,6 +2,7 @@
 //! in voxels.
 
 use super::grid::{Grid, LANES, Lanes, bounds};
+use crate::simd::wide;
 use core::f64::consts::TAU;
 use libm::{acos, cos};
 use nalgebra::Vector3;
@@ -43,7 +44,7 @@ pub fn normals(points: &[[f32; 3]], viewpoint: impl Fn(usize) -> Vector3<f64>) -
         lanes.fill(points, &near);
         for &k in cell {
             let k = k as usize;
-            let moments = arch.dispatch(|| moments(&lanes, &points[k]));
+            let moments = wide(arch, || moments(&lanes, &points[k]));
             let towards = viewpoint(k) - Vector3::from(points[k].map(f64::from));
             normals[k] = normal(&moments, &towards);
         }
