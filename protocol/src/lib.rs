@@ -24,6 +24,7 @@ pub mod gossip;
 pub mod ids;
 pub mod recording;
 pub mod replica;
+mod simd;
 pub mod snapshot;
 pub mod submap;
 pub mod time;

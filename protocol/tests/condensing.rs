@@ -9,8 +9,10 @@ use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::time::Instant;
 use std::time::Duration;
 
-/// Keyframes that one robot drives: a little less than once around.
-const KEYFRAMES: usize = 36;
+/// Keyframes that one robot drives.
+const KEYFRAMES: usize = 54;
+/// Those of the first robot in fog: what it sees there, nothing can be aligned with.
+const FOG: core::ops::Range<usize> = 9..30;
 
 fn agent(k: usize, condense_entries: u32, records: Vec<Record>) -> Agent {
     let mut config = config();
@@ -23,7 +25,10 @@ fn swarm(condense_entries: u32) -> Wires {
     let world = World::new(1);
     let mut wires = Wires::new((0..2).map(|k| agent(k, condense_entries, vec![])).collect());
     for k in 0..2 {
-        for keyframe in drive(&world, k, KEYFRAMES).0 {
+        for (n, mut keyframe) in drive(&world, k, KEYFRAMES).0.into_iter().enumerate() {
+            if k == 0 && FOG.contains(&n) {
+                keyframe.points.truncate(20);
+            }
             wires.input(k, Input::Keyframe(keyframe));
             wires.run(Duration::from_millis(300));
         }
@@ -46,7 +51,7 @@ fn the_map_stays_and_the_bytes_go() {
     let (whole, short) = (swarm(0), swarm(12));
     assert!(condensed(&whole).is_empty());
     let bytes = condensed(&short);
-    assert!(bytes.len() >= 2 && bytes.iter().all(|[before, after]| 4 * after <= 3 * before), "{bytes:?}");
+    assert!(!bytes.is_empty() && bytes.iter().all(|[before, after]| 4 * after <= 3 * before), "{bytes:?}");
     assert_eq!(short.agents[0].digest(), short.agents[1].digest());
     let merged = |wires: &Wires| wires.agents.iter().all(|agent| agent.status().merged_with.len() == 1);
     assert!(merged(&whole) && merged(&short));

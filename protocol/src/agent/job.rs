@@ -7,7 +7,7 @@ use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEsti
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
-use crate::submap::{self, Described, Features, Keypoints, RefineConfig, Submap};
+use crate::submap::{self, Described, Features, Keypoints, RegisterConfig, RegisterError, Submap};
 use crate::wire::fact::{RefusalReason, ScaleKind};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -175,8 +175,33 @@ impl SolveJob {
 }
 
 impl AlignJob {
-    /// Matches, finds a consensus, checks the fit, refines (MATH §4; PERCEPTION).
+    /// Where units are metres, clouds judge the poses that matches suggest; else the matches alone decide.
     fn run(&self) -> Result<Measured, RefusalReason> {
+        match self.scale {
+            ScaleKind::Metric => self.register(),
+            ScaleKind::Unknown => self.align(),
+        }
+    }
+
+    fn register(&self) -> Result<Measured, RefusalReason> {
+        let config =
+            RegisterConfig { solver: self.solver(), fit_min: self.config.fit_min, ..RegisterConfig::default() };
+        let found = submap::register(&self.theirs, &self.mine, &config).map_err(|error| match error {
+            RegisterError::NoConsensus { .. } => RefusalReason::NoConsensus,
+            RegisterError::Ambiguous { .. } => RefusalReason::Ambiguous,
+            RegisterError::Refine(_) => RefusalReason::Degenerate,
+            RegisterError::Solver(_) => RefusalReason::BadInput,
+        })?;
+        Ok(Measured {
+            t_mine_theirs: Relative::Metric(found.refined.pose),
+            sigma: found.refined.rms,
+            support: found.support,
+            log10_nfa: found.log10_nfa,
+        })
+    }
+
+    /// Matches, finds a consensus, checks the fit (MATH §4).
+    fn align(&self) -> Result<Measured, RefusalReason> {
         let matches = submap::match_keypoints(&self.theirs, &self.mine);
         let problem = Problem {
             source: &matches.source,
@@ -192,13 +217,7 @@ impl AlignJob {
         if fit < self.config.fit_min {
             return Err(RefusalReason::PoorFit);
         }
-        let t_mine_theirs = match &found.t_target_source {
-            Relative::Metric(p) => {
-                let refined = submap::refine(&self.theirs, &self.mine, &p.pose, &RefineConfig::default());
-                Relative::Metric(refined.map_err(|_| RefusalReason::Degenerate)?.pose)
-            }
-            similarity @ Relative::Similarity(_) => *similarity,
-        };
+        let t_mine_theirs = found.t_target_source;
         let (sigma, support, log10_nfa) = (found.sigma, found.support, found.log10_nfa);
         Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
     }

@@ -5,6 +5,7 @@ use super::prepare::Matches;
 use super::refine::Context;
 use super::solve::Motion;
 use super::tally::{Tally, Worth};
+use crate::simd::wide;
 use nalgebra::Vector3;
 use pulp::Arch;
 use wide::i8x16;
@@ -254,14 +255,6 @@ pub(super) fn positions(words: &[u64], after: Option<usize>, out: &mut Vec<u32>)
         len += count;
     }
     len
-}
-
-/// Runs `f` with the widest instructions of the processor. Rust never fuses or reorders arithmetic, so results are the same
-/// to the bit with any. What `f` calls is compiled for them only if inlined; the bound makes it a closure that is called
-/// once, without a shim that would stand between.
-#[inline(always)]
-pub(super) fn wide<R>(arch: Arch, f: impl FnOnce() -> R) -> R {
-    arch.dispatch(f)
 }
 
 /// Number of common bits.

@@ -7,12 +7,13 @@
 //! agree about a pair take the place of triangles ([`super::turns`]). Each motion is worth its own number of false alarms
 //! ([`super::tally`]), is improved by reweighted solves, and spares the triangles it explains: candidates are distinct.
 
-use super::graph::{Cloud, Graph, common, positions, wide};
+use super::graph::{Cloud, Graph, common, positions};
 use super::refine::Context;
 use super::scales::{Scales, Vote};
 use super::solve::{self, Motion};
 use super::tally::{Tally, Worth};
 use super::turns::{self, Noise, Turns};
+use crate::simd::wide;
 use core::cmp::Reverse;
 use nalgebra::Vector3;
 use pulp::Arch;

@@ -4,7 +4,8 @@
 //! cut into bins no wider than the votes of typical pairs, and each pair's first and last bin are noted once; the pairs
 //! that agree at the scale of a bin are then read off by comparing bytes, and form a graph as sparse as a rigid motion's.
 
-use super::graph::{Cloud, Graph, lengths, pack, wide};
+use super::graph::{Cloud, Graph, lengths, pack};
+use crate::simd::wide;
 use pulp::Arch;
 
 /// Bins at most; a bin's number is a byte.

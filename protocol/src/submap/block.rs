@@ -1,21 +1,21 @@
-//! The one binary layout of described points, used for keypoint blobs (sent) and for features (kept): a header with
-//! every dimension and scale, then 26 bytes a point. Points are held quantised, so that what was decoded equals what
-//! was encoded, and what a restarted robot computes equals what it computed before.
+//! The one binary layout of points, used for keypoint blobs (sent, with descriptors) and for features (kept, without):
+//! a header with every dimension and scale, then 9 bytes a point and its descriptor. Points are held quantised, so that
+//! what was decoded equals what was encoded, and what a restarted robot computes equals what it computed before.
 //!
 //! Little-endian. Header: magic, version, descriptor dimensions, bits, voxel edge and position step (f32, frame units),
-//! count. Point: position 3 × i16 steps, normal as octahedral 2 × u8, roughness u8 (255: no surface), descriptor 17 B.
+//! count. Point: position 3 × i16 steps, normal as octahedral 2 × u8, roughness u8 (255: no surface), descriptor.
 
-use super::cloud::Normal;
-use super::descriptor::{self, Packed};
+use super::descriptor;
+use super::surface::Normal;
 use nalgebra::Vector3;
 use thiserror::Error;
 
 /// Version of the layout.
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 /// Bytes before the first point.
 pub const HEADER_LEN: usize = 18;
-/// Bytes of one point.
-pub const POINT_LEN: usize = 9 + descriptor::PACKED_LEN;
+/// Bytes of one point without its descriptor.
+pub const BARE_LEN: usize = 9;
 /// Position steps per voxel where the cloud is small enough: quantisation then costs 0.5 % of a voxel.
 const STEPS_PER_VOXEL: f64 = 64.0;
 /// Position steps per voxel at least: points so far out that they need coarser ones are left out.
@@ -85,14 +85,22 @@ pub enum BlockError {
     },
 }
 
-/// A point as it is stored: quantised.
+/// A point as it is stored: quantised, with `N` bytes of descriptor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stored {
+pub struct Stored<const N: usize> {
     position: [i16; 3],
     normal: [u8; 2],
     roughness: u8,
     /// The point's descriptor.
-    pub descriptor: Packed,
+    pub descriptor: [u8; N],
+}
+
+impl Stored<0> {
+    /// The point with a descriptor.
+    pub fn with<const N: usize>(self, descriptor: [u8; N]) -> Stored<N> {
+        let Self { position, normal, roughness, .. } = self;
+        Stored { position, normal, roughness, descriptor }
+    }
 }
 
 /// A point as it is used: a small piece of surface.
@@ -106,18 +114,23 @@ pub struct Surfel {
     pub roughness: Option<f64>,
 }
 
-/// Described points with their scales.
+/// Points with their scales.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Block {
+pub struct Block<const N: usize> {
     /// Edge of the thinning voxel, frame units.
     voxel: f32,
     /// Frame units per position step.
     step: f32,
     /// The points, most important first.
-    pub points: Vec<Stored>,
+    pub points: Vec<Stored<N>>,
 }
 
-impl Block {
+impl<const N: usize> Block<N> {
+    /// Bytes of one point.
+    pub const POINT_LEN: usize = BARE_LEN + N;
+    /// What the header says of descriptors: how many numbers, and bits of each.
+    const LAYOUT: (usize, usize) = if N == 0 { (0, 0) } else { (descriptor::DIMENSIONS, descriptor::BITS) };
+
     /// An empty block for points of a cloud thinned to `voxel`, the farthest at `reach` along any axis.
     pub fn new(voxel: f64, reach: f64) -> Self {
         let step = (reach / STEP_MAX).clamp(voxel / STEPS_PER_VOXEL, voxel / STEPS_PER_VOXEL_MIN);
@@ -125,8 +138,8 @@ impl Block {
     }
 
     /// An empty block with this one's scales.
-    pub fn like(&self) -> Self {
-        Self { points: Vec::new(), ..*self }
+    pub fn like<const M: usize>(&self) -> Block<M> {
+        Block { voxel: self.voxel, step: self.step, points: Vec::new() }
     }
 
     /// Edge of the thinning voxel, frame units.
@@ -134,14 +147,14 @@ impl Block {
         f64::from(self.voxel)
     }
 
-    /// The point in stored form; `None` if it lies too far out.
-    pub fn store(&self, position: &Vector3<f64>, normal: &Normal, descriptor: Packed) -> Option<Stored> {
+    /// The point in stored form (the normal's roughness is in voxels); `None` if it lies too far out.
+    pub fn store(&self, position: &Vector3<f64>, normal: &Normal, descriptor: [u8; N]) -> Option<Stored<N>> {
         let steps = position.map(|x| (x / f64::from(self.step)).round());
         if !steps.iter().all(|s| s.abs() <= STEP_MAX) {
             return None;
         }
         let roughness = normal.roughness.map_or(NO_SURFACE, |r| {
-            (r / self.voxel() * ROUGHNESS_LEVELS_PER_VOXEL).round().clamp(0.0, f64::from(NO_SURFACE - 1)) as u8
+            (r * ROUGHNESS_LEVELS_PER_VOXEL).round().clamp(0.0, f64::from(NO_SURFACE - 1)) as u8
         });
         Some(Stored {
             position: [steps.x as i16, steps.y as i16, steps.z as i16],
@@ -151,12 +164,17 @@ impl Block {
         })
     }
 
+    /// Whether a point can be stored.
+    pub fn reaches(&self, position: &[f32; 3]) -> bool {
+        position.iter().all(|x| (f64::from(*x) / f64::from(self.step)).round().abs() <= STEP_MAX)
+    }
+
     /// The points in usable form.
     pub fn surfels(&self) -> Vec<Surfel> {
         self.points.iter().map(|p| self.surfel(p)).collect()
     }
 
-    fn surfel(&self, point: &Stored) -> Surfel {
+    fn surfel(&self, point: &Stored<N>) -> Surfel {
         let roughness = f64::from(point.roughness) * self.voxel() / ROUGHNESS_LEVELS_PER_VOXEL;
         Surfel {
             position: Vector3::from(point.position.map(f64::from)) * f64::from(self.step),
@@ -167,9 +185,9 @@ impl Block {
 
     /// The block as bytes, `magic` first.
     pub fn encode(&self, magic: [u8; 2]) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(HEADER_LEN + self.points.len() * POINT_LEN);
+        let mut bytes = Vec::with_capacity(HEADER_LEN + self.points.len() * Self::POINT_LEN);
         bytes.extend(magic);
-        bytes.extend([VERSION, descriptor::DIMENSIONS as u8, descriptor::BITS as u8, 0]);
+        bytes.extend([VERSION, Self::LAYOUT.0 as u8, Self::LAYOUT.1 as u8, 0]);
         bytes.extend(self.voxel.to_le_bytes());
         bytes.extend(self.step.to_le_bytes());
         bytes.extend(u32::try_from(self.points.len()).unwrap_or(u32::MAX).to_le_bytes());
@@ -194,8 +212,7 @@ impl Block {
         if [m0, m1] != magic {
             return Err(BlockError::WrongKind { found: [m0, m1], expected: magic });
         }
-        if (version, usize::from(dimensions), usize::from(bits), spare)
-            != (VERSION, descriptor::DIMENSIONS, descriptor::BITS, 0)
+        if (version, usize::from(dimensions), usize::from(bits), spare) != (VERSION, Self::LAYOUT.0, Self::LAYOUT.1, 0)
         {
             return Err(BlockError::UnknownLayout { version, dimensions, bits });
         }
@@ -211,22 +228,23 @@ impl Block {
         if count as usize > points_max {
             return Err(BlockError::TooManyPoints { count, max: points_max });
         }
-        let expected = HEADER_LEN + count as usize * POINT_LEN;
+        let expected = HEADER_LEN + count as usize * Self::POINT_LEN;
         if bytes.len() != expected {
             return Err(BlockError::WrongLength { len: bytes.len(), expected });
         }
-        let points = body.as_chunks::<POINT_LEN>().0.iter().enumerate();
+        let points = body.chunks_exact(Self::POINT_LEN).enumerate();
         let points = points.map(|(index, p)| stored(p).ok_or(BlockError::NotCanonical { index }));
         Ok(Self { voxel, step, points: points.collect::<Result<_, _>>()? })
     }
 }
 
 /// Parses one point; `None` if it uses a code that [`Block::store`] never makes.
-fn stored(bytes: &[u8; POINT_LEN]) -> Option<Stored> {
-    let [x0, x1, y0, y1, z0, z1, n0, n1, roughness, descriptor @ ..] = *bytes;
+fn stored<const N: usize>(bytes: &[u8]) -> Option<Stored<N>> {
+    let (bare, descriptor) = bytes.split_first_chunk::<BARE_LEN>()?;
+    let [x0, x1, y0, y1, z0, z1, n0, n1, roughness] = *bare;
     let position = [i16::from_le_bytes([x0, x1]), i16::from_le_bytes([y0, y1]), i16::from_le_bytes([z0, z1])];
-    let good =
-        position.iter().all(|&x| x != i16::MIN) && n0 != 255 && n1 != 255 && descriptor::is_canonical(&descriptor);
+    let good = position.iter().all(|&x| x != i16::MIN) && n0 != 255 && n1 != 255;
+    let descriptor = descriptor.try_into().ok()?;
     good.then_some(Stored { position, normal: [n0, n1], roughness, descriptor })
 }
 

@@ -1,22 +1,11 @@
-//! Geometry of a thinned cloud: neighbours within a radius (kiddo's k-d tree), and normals by principal components
-//! of the neighbourhood, turned towards the viewpoint.
+//! Neighbours within a radius among the points of a thinned cloud (kiddo's k-d tree).
 //!
 //! The tree only proposes: distances are recomputed here in f64 and ties go to the smaller position, so that results do
 //! not depend on how the tree was laid out or compiled.
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 
-/// Radius of the neighbourhood that a normal is fitted to, in voxels.
-pub const NORMAL_RADIUS_VOXELS: f64 = 3.0;
-/// Neighbours used for a normal at most (the nearest).
-const NORMAL_NEIGHBOURS_MAX: usize = 30;
-/// Points (itself included) a normal needs at least.
-const NORMAL_NEIGHBOURS_MIN: usize = 5;
-/// A surface is at least this wide for its length (ratio of standard deviations), else it is a line...
-const WIDTH_MIN: f64 = 0.2;
-/// ...and at most this thick for its width, else it is a blob.
-const THICKNESS_MAX: f64 = 0.8;
 /// Slack on the radius asked of the tree, so that rounding inside it cannot lose a neighbour.
 const RADIUS_SLACK: f64 = 1.0 + 1e-9;
 
@@ -62,44 +51,6 @@ impl<'a> Index<'a> {
     }
 }
 
-/// A point's normal and how well a plane fits around it.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Normal {
-    /// Unit normal, towards the viewpoint.
-    pub direction: Vector3<f64>,
-    /// Standard deviation of the neighbourhood about its plane, frame units; `None` where there is no plane to speak
-    /// of (too few neighbours, a line, a blob).
-    pub roughness: Option<f64>,
-}
-
-/// The normal at `at` from its neighbours (nearest first, itself included), as seen from `viewpoint`.
-pub fn normal(
-    points: &[Vector3<f64>],
-    neighbours: &[Neighbour],
-    at: &Vector3<f64>,
-    viewpoint: &Vector3<f64>,
-) -> Normal {
-    let near = &neighbours[..neighbours.len().min(NORMAL_NEIGHBOURS_MAX)];
-    let towards = viewpoint - at;
-    let unknown = Normal { direction: towards.try_normalize(1e-9).unwrap_or_else(Vector3::z), roughness: None };
-    if near.len() < NORMAL_NEIGHBOURS_MIN {
-        return unknown;
-    }
-    // Relative to the point itself: coordinates far from the anchor would cost digits.
-    let count = near.len() as f64;
-    let offset = |n: &Neighbour| points[n.0 as usize] - at;
-    let mean = near.iter().map(offset).sum::<Vector3<f64>>() / count;
-    let spread = near.iter().map(|n| offset(n) - mean).map(|d| d * d.transpose()).sum::<Matrix3<f64>>() / count;
-    let eigen = spread.symmetric_eigen();
-    let mut order = [0, 1, 2];
-    order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
-    let [thickness, width, length] = order.map(|k| eigen.eigenvalues[k].max(0.0).sqrt());
-    let Some(axis) = eigen.eigenvectors.column(order[0]).into_owned().try_normalize(1e-9) else { return unknown };
-    let direction = if axis.dot(&towards) < 0.0 { -axis } else { axis };
-    let is_surface = length > 0.0 && width >= WIDTH_MIN * length && thickness <= THICKNESS_MAX * width;
-    Normal { direction, roughness: is_surface.then_some(thickness) }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -136,21 +87,5 @@ mod tests {
             assert_eq!(Index::new(&wall).within(&at, 0.35), brute(&wall, &at, 0.35));
         }
         assert!(Index::new(&[]).nearest(&Vector3::zeros(), 1.0).is_none());
-    }
-
-    #[test]
-    fn normals_face_the_viewpoint_and_lines_have_none() {
-        let plane: Vec<_> = (0..49).map(|k| Vector3::new(f64::from(k % 7), f64::from(k / 7), 2.0)).collect();
-        let at = plane[24];
-        let all = brute(&plane, &at, 3.0);
-        for z in [-5.0, 5.0] {
-            let n = normal(&plane, &all, &at, &Vector3::new(1.0, 2.0, z));
-            assert!((n.direction - Vector3::z() * z.signum()).norm() < 1e-12);
-            assert_eq!(n.roughness, Some(0.0));
-        }
-        let line: Vec<_> = (0..9).map(|k| Vector3::new(f64::from(k), 0.0, 0.0)).collect();
-        assert_eq!(normal(&line, &brute(&line, &line[4], 9.0), &line[4], &Vector3::z()).roughness, None);
-        let place = vec![Vector3::zeros(); 9];
-        assert_eq!(normal(&place, &brute(&place, &place[4], 9.0), &place[4], &Vector3::z()).roughness, None);
     }
 }

@@ -1,112 +1,150 @@
-//! FPFH (Rusu, Blodow, Beetz 2009): 33 numbers that describe how normals turn around a point, blind to rotation and
-//! translation; quantised as 4-bit square roots into 17 bytes, which on real submaps matches as well as 132 bytes of
-//! f32 (measured). Three histograms of 11 bins, over the three angles between a pair of points and their normals.
+//! From the `rings` about a point to its descriptor: a fixed linear map takes the 60 numbers to 32 in
+//! which two views of one place differ about equally along every axis and different places as much as can be (linear
+//! discriminant analysis with a ridge, learnt on ray-cast halls: no recorded data). A peer is sent 3 bits of each, 12
+//! bytes; one's own points keep 8. Measured on real submaps: of the right matches that 60 exact numbers find, 4 % are
+//! lost by the map and 8 % by the rounding.
 
-use super::cloud::{Neighbour, Normal};
-use libm::atan2;
-use nalgebra::Vector3;
-use std::f64::consts::PI;
+use super::rings::{self, NUMBERS};
 
-/// Radius of the neighbourhood described, in voxels (measured: 7 gives a fifth more inliers than 5; 9 no more).
-pub const RADIUS_VOXELS: f64 = 7.0;
-/// Neighbours used at most, taken evenly over their distances.
-pub const NEIGHBOURS_MAX: usize = 100;
-/// Bins of one histogram.
-const BINS: usize = 11;
 /// Numbers in a descriptor.
-pub const DIMENSIONS: usize = 3 * BINS;
-/// Bits of a quantised number.
-pub const BITS: usize = 4;
-/// Bytes of a quantised descriptor.
-pub const PACKED_LEN: usize = (DIMENSIONS * BITS).div_ceil(8);
-/// Largest value of a bin: a histogram of the point itself and one of its neighbours, 100 % each.
-pub const VALUE_MAX: f64 = 200.0;
-/// Largest level of a quantised number.
-const LEVEL_MAX: f64 = 15.0;
+pub const DIMENSIONS: usize = 32;
+/// Bits of each on the wire.
+pub const BITS: usize = 3;
+/// Bytes of a descriptor on the wire.
+pub const PACKED_LEN: usize = DIMENSIONS * BITS / 8;
+/// Levels on the wire.
+const LEVELS: f32 = 8.0;
+/// The wire's levels span this many standard deviations to either side.
+const SPAN_SIGMAS: f32 = 2.5;
+/// Steps of a code per standard deviation between two views of one place.
+const STEPS: f32 = 8.0;
 
-type Histogram = [f64; DIMENSIONS];
-
-/// A quantised descriptor: [`DIMENSIONS`] levels of 0 to 15, low nibble first; the spare nibble is zero.
+/// A descriptor as it is compared: squared differences add up.
+pub type Code = [i8; DIMENSIONS];
+/// A descriptor as it is sent: levels of 3 bits, least first.
 pub type Packed = [u8; PACKED_LEN];
 
-/// The descriptors of all points. `neighbours[k]` are those of point k within [`RADIUS_VOXELS`], nearest first, the
-/// point itself included.
-pub fn describe_points(points: &[Vector3<f64>], normals: &[Normal], neighbours: &[Vec<Neighbour>]) -> Vec<Packed> {
-    let own: Vec<Histogram> = (0..points.len()).map(|k| own_histogram(k, points, normals, &neighbours[k])).collect();
-    (0..points.len()).map(|k| pack(&fpfh(k, &own, &neighbours[k]))).collect()
+/// Little-endian: the 60 means, then for each of the 32 numbers its standard deviation, the unit of its weights (f32)
+/// and its 60 weights (i8).
+const TABLE: &[u8; 4 * NUMBERS + DIMENSIONS * (8 + NUMBERS)] = include_bytes!("projection.bin");
+
+/// The linear map.
+pub struct Projection {
+    means: [f32; NUMBERS],
+    sigmas: [f32; DIMENSIONS],
+    /// By input, so that the outputs are summed side by side.
+    weights: [[f32; DIMENSIONS]; NUMBERS],
 }
 
-/// The levels of a packed descriptor.
-pub fn unpack(packed: &Packed) -> [u8; DIMENSIONS] {
-    core::array::from_fn(|k| if k % 2 == 0 { packed[k / 2] & 15 } else { packed[k / 2] >> 4 })
-}
-
-/// Whether the spare nibble is zero, as [`pack`] leaves it.
-pub fn is_canonical(packed: &Packed) -> bool {
-    packed[PACKED_LEN - 1] >> 4 == 0
-}
-
-fn pack(histogram: &Histogram) -> Packed {
-    let mut packed = [0; PACKED_LEN];
-    for (k, value) in histogram.iter().enumerate() {
-        let level = ((value / VALUE_MAX).clamp(0.0, 1.0).sqrt() * LEVEL_MAX).round() as u8;
-        packed[k / 2] |= level << (4 * (k % 2));
-    }
-    packed
-}
-
-/// The simplified histogram of one point: its angles to each neighbour, each of the three parts summing to 100.
-fn own_histogram(k: usize, points: &[Vector3<f64>], normals: &[Normal], neighbours: &[Neighbour]) -> Histogram {
-    let mut histogram = [0.0; DIMENSIONS];
-    let mut pairs = 0.0;
-    for (other, _) in others(k, neighbours) {
-        let Some(angles) = pair_angles(&points[k], &normals[k].direction, &points[other], &normals[other].direction)
-        else {
-            continue;
-        };
-        pairs += 1.0;
-        for (part, (angle, low, high)) in
-            angles.iter().zip([(-PI, PI), (-1.0, 1.0), (-1.0, 1.0)]).map(|(a, (l, h))| (*a, l, h)).enumerate()
-        {
-            let bin = (BINS as f64 * (angle - low) / (high - low)).floor().clamp(0.0, (BINS - 1) as f64) as usize;
-            histogram[part * BINS + bin] += 1.0;
+impl Projection {
+    /// Reads the table.
+    pub fn new() -> Self {
+        let float = |at: usize| f32::from_le_bytes([TABLE[at], TABLE[at + 1], TABLE[at + 2], TABLE[at + 3]]);
+        let row = |k: usize| 4 * NUMBERS + k * (8 + NUMBERS);
+        let weight = |k: usize, d: usize| f32::from(TABLE[row(k) + 8 + d] as i8) * float(row(k) + 4);
+        Self {
+            means: core::array::from_fn(|d| float(4 * d)),
+            sigmas: core::array::from_fn(|k| float(row(k))),
+            weights: core::array::from_fn(|d| core::array::from_fn(|k| weight(k, d))),
         }
     }
-    if pairs > 0.0 {
-        histogram.iter_mut().for_each(|h| *h *= 100.0 / pairs);
+
+    fn numbers(&self, of: &rings::Numbers) -> [f32; DIMENSIONS] {
+        let mut sums = [0.0; DIMENSIONS];
+        for ((weights, number), mean) in self.weights.iter().zip(of).zip(&self.means) {
+            for (sum, weight) in sums.iter_mut().zip(weights) {
+                *sum += weight * (number - mean);
+            }
+        }
+        sums
     }
-    histogram
+
+    /// The descriptor to compare with.
+    pub fn code(&self, of: &rings::Numbers) -> Code {
+        self.numbers(of).map(|x| (x * STEPS).round().clamp(-127.0, 127.0) as i8)
+    }
+
+    /// The descriptor to send.
+    pub fn pack(&self, of: &rings::Numbers) -> Packed {
+        let numbers = self.numbers(of);
+        let mut packed = [0; PACKED_LEN];
+        for (k, (number, sigma)) in numbers.iter().zip(self.sigmas).enumerate() {
+            let half = SPAN_SIGMAS * sigma;
+            let level = ((number + half) / (2.0 * half) * LEVELS).floor().clamp(0.0, LEVELS - 1.0) as u16;
+            let (byte, bit) = (BITS * k / 8, BITS * k % 8);
+            let [low, high] = (level << bit).to_le_bytes();
+            packed[byte] |= low;
+            if high != 0 {
+                packed[byte + 1] |= high;
+            }
+        }
+        packed
+    }
+
+    /// What was sent, to compare with: the middle of each level.
+    pub fn unpack(&self, packed: &Packed) -> Code {
+        core::array::from_fn(|k| {
+            let level = f32::from(level(packed, k));
+            let middle = ((level + 0.5) / LEVELS * 2.0 - 1.0) * SPAN_SIGMAS * self.sigmas[k];
+            (middle * STEPS).round().clamp(-127.0, 127.0) as i8
+        })
+    }
 }
 
-/// The point's own histogram plus its neighbours', weighted by inverse squared distance and again summing to 100.
-fn fpfh(k: usize, own: &[Histogram], neighbours: &[Neighbour]) -> Histogram {
-    let mut around = [0.0; DIMENSIONS];
-    for (other, squared) in others(k, neighbours).filter(|n| n.1 > 0.0) {
-        for (sum, value) in around.iter_mut().zip(&own[other]) {
-            *sum += value / squared;
+impl Projection {
+    /// Where each number lies among `levels` that span what the wire's do: from 0 to `levels` − 1, the middle of the
+    /// first to that of the last.
+    pub fn places(&self, code: &Code, levels: usize) -> [f32; DIMENSIONS] {
+        core::array::from_fn(|k| {
+            let share = (f32::from(code[k]) / STEPS / (SPAN_SIGMAS * self.sigmas[k]) + 1.0) / 2.0;
+            (share * levels as f32 - 0.5).clamp(0.0, (levels - 1) as f32)
+        })
+    }
+}
+
+/// The k-th level.
+pub fn level(packed: &Packed, k: usize) -> u8 {
+    let (byte, bit) = (BITS * k / 8, BITS * k % 8);
+    let high = packed.get(byte + 1).copied().unwrap_or(0);
+    (u16::from_le_bytes([packed[byte], high]) >> bit) as u8 & (LEVELS as u8 - 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn the_table_is_usable() {
+        let p = Projection::new();
+        assert!(p.means.iter().chain(p.weights.iter().flatten()).all(|x| x.is_finite() && x.abs() < 100.0));
+        assert!(p.sigmas.is_sorted_by(|a, b| a >= b) && p.sigmas.iter().all(|&s| s > 0.1 && s < 10.0));
+    }
+
+    proptest! {
+        #[test]
+        fn a_packed_descriptor_is_the_same_within_half_a_level(
+            numbers in prop::collection::vec(-1.0..1.0f32, NUMBERS),
+        ) {
+            let projection = Projection::new();
+            let numbers: rings::Numbers = numbers.try_into().unwrap();
+            let (exact, sent) = (projection.numbers(&numbers), projection.unpack(&projection.pack(&numbers)));
+            for k in 0..DIMENSIONS {
+                let half = SPAN_SIGMAS * projection.sigmas[k];
+                if exact[k].abs() < half {
+                    let error = (f32::from(sent[k]) / STEPS - exact[k]).abs();
+                    prop_assert!(error <= half / LEVELS + 0.51 / STEPS, "{k}: {error}");
+                }
+            }
+        }
+
+        #[test]
+        fn any_bytes_are_a_descriptor(packed in prop::array::uniform12(any::<u8>())) {
+            let mut again = [0u16; DIMENSIONS];
+            (0..DIMENSIONS).for_each(|k| again[k] = level(&packed, k).into());
+            let mut bits: u128 = 0;
+            again.iter().rev().for_each(|&level| bits = bits << BITS | u128::from(level));
+            prop_assert_eq!(&bits.to_le_bytes()[..PACKED_LEN], &packed);
         }
     }
-    for part in around.chunks_exact_mut(BINS) {
-        let sum: f64 = part.iter().sum();
-        if sum > 0.0 {
-            part.iter_mut().for_each(|h| *h *= 100.0 / sum);
-        }
-    }
-    core::array::from_fn(|b| own[k][b] + around[b])
-}
-
-fn others(k: usize, neighbours: &[Neighbour]) -> impl Iterator<Item = (usize, f64)> {
-    neighbours.iter().map(|n| (n.0 as usize, n.1)).filter(move |n| n.0 != k)
-}
-
-/// (θ, α, φ) of a pair in its Darboux frame; the same whichever point comes first. `None` for coincident points or a
-/// normal along the line between them.
-fn pair_angles(p1: &Vector3<f64>, n1: &Vector3<f64>, p2: &Vector3<f64>, n2: &Vector3<f64>) -> Option<[f64; 3]> {
-    let d = (p2 - p1).try_normalize(1e-12)?;
-    let (a1, a2) = (n1.dot(&d), n2.dot(&d));
-    // The frame stands on the normal that leans more towards the other point.
-    let (d, u, other, phi) = if a1.abs() < a2.abs() { (-d, n2, n1, -a2) } else { (d, n1, n2, a1) };
-    let v = d.cross(u).try_normalize(1e-9)?;
-    let w = u.cross(&v);
-    Some([atan2(w.dot(other), u.dot(other)), v.dot(other), phi])
 }

@@ -1,10 +1,15 @@
 //! What is known of a submap's points: [`Keypoints`] are the few that a peer may fetch (a content-addressed blob),
 //! [`Features`] are all of them, kept privately by the owner. Both share one bounded layout; keypoints are the prefix
 //! of a priority order, so fewer are cut from more by keeping the first.
+//!
+//! Describing *all* points takes several times as long as everything else about a submap, and most submaps are never
+//! compared with a peer's. So keypoints carry their descriptors, and features come by theirs when first asked.
 
-use super::block::{Block, BlockError, HEADER_LEN, POINT_LEN, Surfel};
-use super::descriptor::{self, DIMENSIONS};
+use super::block::{BARE_LEN, Block, BlockError, HEADER_LEN, Surfel};
+use super::descriptor::{Code, PACKED_LEN, Projection};
+use super::rings;
 use nalgebra::Vector3;
+use std::sync::OnceLock;
 
 /// Keypoints in a blob at most.
 pub const KEYPOINTS_MAX: usize = 1024;
@@ -21,20 +26,33 @@ const FEATURES_MAGIC: [u8; 2] = *b"mf";
 
 /// The described points that a submap's owner offers to others, most important first, in the anchor frame.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Keypoints(pub(super) Block);
+pub struct Keypoints(pub(super) Block<PACKED_LEN>);
 
 /// All described points of one's own submap, in the anchor frame, and from where they were seen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Features {
-    pub(super) block: Block,
+    pub(super) block: Block<0>,
     /// Positions of the keyframes.
     pub(super) viewpoints: Vec<[f32; 3]>,
     /// For each point, the position in `viewpoints` of the keyframe that saw it first, or [`UNSEEN`].
     pub(super) seen_from: Vec<u8>,
+    /// Descriptors, once asked for.
+    pub(super) codes: Codes,
+}
+
+/// A function of the points, computed once.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Codes(OnceLock<Vec<Code>>);
+
+impl PartialEq for Codes {
+    /// Computed or not: equal points have equal descriptors.
+    fn eq(&self, _: &Self) -> bool {
+        true
+    }
 }
 
 impl Keypoints {
-    /// The blob: at most 18 + 26 × [`KEYPOINTS_MAX`] bytes.
+    /// The blob: at most 18 + 21 × [`KEYPOINTS_MAX`] bytes.
     pub fn encode(&self) -> Vec<u8> {
         self.0.encode(KEYPOINTS_MAGIC)
     }
@@ -54,6 +72,12 @@ impl Keypoints {
         block.points.extend(self.0.points.iter().take(count));
         Self(block)
     }
+
+    /// The descriptors.
+    pub(super) fn codes(&self) -> Vec<Code> {
+        let projection = Projection::new();
+        self.0.points.iter().map(|p| projection.unpack(&p.descriptor)).collect()
+    }
 }
 
 impl Features {
@@ -67,8 +91,18 @@ impl Features {
         &self.seen_from
     }
 
+    /// The descriptors of all points. The first time this takes about 3 µs a point.
+    pub(super) fn codes(&self) -> &[Code] {
+        self.codes.0.get_or_init(|| {
+            let (points, normals) = in_voxels(&self.block);
+            let all: Vec<u32> = (0..).take(points.len()).collect();
+            let projection = Projection::new();
+            rings::describe_points(&points, &normals, &all).iter().map(|numbers| projection.code(numbers)).collect()
+        })
+    }
+
     /// The features as a private disk record: viewpoints (12 bytes each, one byte for their number), one byte a point
-    /// that tells which saw it, then 26 bytes a point.
+    /// that tells which saw it, then 9 bytes a point.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = self.block.encode(FEATURES_MAGIC);
         bytes.extend(&self.seen_from);
@@ -97,15 +131,22 @@ impl Features {
             return Err(BlockError::BadScale);
         }
         // What remains is the block and one byte for each of its points.
-        let points = rest.len().saturating_sub(HEADER_LEN) / (POINT_LEN + 1);
+        let points = rest.len().saturating_sub(HEADER_LEN) / (BARE_LEN + 1);
         let (block, seen_from) = rest.split_at(rest.len() - points);
         let block = Block::decode(block, FEATURES_MAGIC, FEATURES_MAX)?;
         let good = |&&seen: &&u8| seen == UNSEEN || usize::from(seen) < count;
         match seen_from.iter().position(|seen| !good(&seen)) {
             Some(index) => Err(BlockError::NotCanonical { index }),
-            None => Ok(Self { block, viewpoints, seen_from: seen_from.to_vec() }),
+            None => Ok(Self { block, viewpoints, seen_from: seen_from.to_vec(), codes: Codes::default() }),
         }
     }
+}
+
+/// Positions in voxels, and normals.
+pub(super) fn in_voxels<const N: usize>(block: &Block<N>) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
+    let voxel = block.voxel();
+    let single = |v: Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32];
+    block.surfels().iter().map(|s| (single(s.position / voxel), single(s.normal))).unzip()
 }
 
 macro_rules! described_points {
@@ -129,11 +170,6 @@ macro_rules! described_points {
             /// The points as pieces of surface.
             pub fn surfels(&self) -> Vec<Surfel> {
                 self.$block.surfels()
-            }
-
-            /// The levels (0 to 15) of each point's descriptor.
-            pub fn descriptors(&self) -> Vec<[u8; DIMENSIONS]> {
-                self.$block.points.iter().map(|p| descriptor::unpack(&p.descriptor)).collect()
             }
         }
     )*};
@@ -165,7 +201,9 @@ mod tests {
         let features = small();
         assert_eq!(features.viewpoints.len(), 3);
         assert!((0..3).all(|k| features.seen_from.contains(&k)));
-        assert_eq!(Features::decode(&features.encode()).unwrap(), features);
+        let decoded = Features::decode(&features.encode()).unwrap();
+        assert_eq!(decoded, features);
+        assert_eq!(decoded.codes(), features.codes());
         // Features and keypoints are told apart.
         assert!(Keypoints::decode(&features.encode()).is_err());
         assert!(Features::decode(&room(1).keypoints.encode()).is_err());

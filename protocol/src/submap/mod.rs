@@ -16,14 +16,22 @@ mod cloud;
 pub mod describe;
 mod descriptor;
 pub mod features;
+mod grid;
+mod hypotheses;
 mod matching;
+mod near;
 mod odometry;
 pub mod refine;
+pub mod register;
+mod rings;
 mod sampling;
+mod scene;
 pub mod summary;
+mod surface;
 #[cfg(test)]
 mod testing;
 mod thinning;
+mod views;
 mod visibility;
 
 pub use block::{BlockError, Surfel};
@@ -32,6 +40,7 @@ pub use describe::{Described, describe};
 pub use features::{Features, Keypoints};
 pub use matching::{Matches, fit, match_keypoints};
 pub use refine::{RefineConfig, RefineError, Refined, refine};
+pub use register::{RegisterConfig, RegisterError, Registered, register};
 pub use summary::{SUMMARY_LEN_MAX, Summary, SummaryError};
 pub use visibility::contradiction;
 

@@ -1,37 +1,48 @@
 //! Which points become keypoints, and in what order: from coarse voxels to fine ones, one point a voxel, so that every
 //! prefix covers the submap evenly and a longer one extends a shorter one. Even cover beats "salient" choice on real
-//! submaps (measured: 64 against 35 of 77 directions found with 128 keypoints).
+//! submaps (measured: 64 against 35 of 77 directions found with 128 keypoints). Lengths are in voxels.
 
+use super::grid::cell_key;
 use super::thinning::hash_of;
-use nalgebra::Vector3;
-use std::collections::BTreeSet;
+use std::collections::HashSet;
 
 /// Doublings of the voxel that the coarsest level has.
 const LEVELS: i32 = 10;
+/// Candidates looked at for each one wanted: a pseudo-random choice.
+const CANDIDATES: usize = 6;
 
-/// Positions of up to `count` of the `candidates` in order of priority.
-pub fn spread(points: &[Vector3<f64>], candidates: &[usize], voxel: f64, count: usize) -> Vec<usize> {
-    let mut waiting: Vec<usize> = candidates.to_vec();
-    waiting.sort_by_key(|&k| (hash_of(&cell(&points[k], voxel)), k));
-    let mut chosen = Vec::with_capacity(count.min(waiting.len()));
+/// Up to `count` of the `candidates` (positions in `points`) in order of priority.
+pub fn spread(points: &[[f32; 3]], candidates: &[u32], count: usize) -> Vec<u32> {
+    let mut waiting = at_random(points, candidates, CANDIDATES * count);
+    let mut chosen: Vec<u32> = Vec::with_capacity(count.min(waiting.len()));
     for level in (0..=LEVELS).rev() {
-        let edge = voxel * f64::from(1 << level);
-        let mut taken: BTreeSet<[i32; 3]> = chosen.iter().map(|&k: &usize| cell(&points[k], edge)).collect();
-        let mut left = Vec::with_capacity(waiting.len());
-        for k in waiting {
-            if chosen.len() < count && taken.insert(cell(&points[k], edge)) {
+        let key = |k: u32| cell_key(points[k as usize].map(|x| (x / (1 << level) as f32).floor() as i32));
+        // Asked only whether it holds a key: its order reaches nothing.
+        let mut taken: HashSet<u64> = chosen.iter().map(|&k| key(k)).collect();
+        waiting.retain(|&k| {
+            let wanted = chosen.len() < count && taken.insert(key(k));
+            if wanted {
                 chosen.push(k);
-            } else {
-                left.push(k);
             }
+            !wanted
+        });
+        if chosen.len() == count {
+            break;
         }
-        waiting = left;
     }
     chosen
 }
 
-fn cell(p: &Vector3<f64>, edge: f64) -> [i32; 3] {
-    [p.x, p.y, p.z].map(|x| (x / edge).floor() as i32)
+/// Up to `count` candidates in an order that only their voxels decide.
+fn at_random(points: &[[f32; 3]], candidates: &[u32], count: usize) -> Vec<u32> {
+    let hashed = |&k: &u32| (hash_of(&points[k as usize].map(|x| x.floor() as i32)), k);
+    let mut hashed: Vec<(u64, u32)> = candidates.iter().map(hashed).collect();
+    if hashed.len() > count && count > 0 {
+        hashed.select_nth_unstable(count - 1);
+        hashed.truncate(count);
+    }
+    hashed.sort_unstable();
+    hashed.into_iter().map(|(_, k)| k).collect()
 }
 
 #[cfg(test)]
@@ -39,22 +50,27 @@ mod tests {
     use super::*;
 
     #[test]
-    fn prefixes_extend_one_another_and_spread_evenly() {
-        let points: Vec<_> = (0..10_000).map(|k| Vector3::new(f64::from(k % 100), f64::from(k / 100), 0.0)).collect();
-        let all: Vec<usize> = (0..points.len()).collect();
-        let long = spread(&points, &all, 1.0, 512);
-        assert_eq!(long.len(), 512);
-        assert_eq!(spread(&points, &all, 1.0, 128), long[..128]);
-        // 128 points over 16 blocks of 25×25: none empty, none with more than three times its share.
-        let mut counts = [0; 16];
-        long[..128].iter().for_each(|&k| counts[(k % 100) / 25 * 4 + k / 2500] += 1);
-        assert!(counts.iter().all(|&c| (3..=24).contains(&c)), "{counts:?}");
+    fn points_are_spread_evenly() {
+        let points: Vec<[f32; 3]> = (0..10_000).map(|k| [(k % 100) as f32, (k / 100) as f32, 0.0]).collect();
+        let all: Vec<u32> = (0..10_000).collect();
+        for count in [128, 512] {
+            let chosen = spread(&points, &all, count);
+            assert_eq!(chosen.len(), count);
+            // The first 128 over 16 blocks of 25×25: none empty, none with more than three times its share.
+            let mut counts = [0; 16];
+            chosen[..128].iter().for_each(|&k| counts[(k % 100 / 25 * 4 + k / 2500) as usize] += 1);
+            assert!(counts.iter().all(|&c| (3..=24).contains(&c)), "{counts:?}");
+        }
+        // All of them, if as many are asked for.
+        let mut every = spread(&points, &all, 20_000);
+        every.sort_unstable();
+        assert_eq!(every, all);
     }
 
     #[test]
     fn coincident_points_give_one_keypoint() {
-        let points = vec![Vector3::zeros(); 50];
-        assert_eq!(spread(&points, &(0..50).collect::<Vec<_>>(), 1.0, 10), vec![0]);
-        assert!(spread(&[], &[], 1.0, 10).is_empty());
+        let points = vec![[0.0; 3]; 50];
+        assert_eq!(spread(&points, &(0..50).collect::<Vec<_>>(), 10).len(), 1);
+        assert!(spread(&[], &[], 10).is_empty());
     }
 }

@@ -1,26 +1,27 @@
 //! A submap's summary: what is gossiped to all, so that each robot can guess which pairs of submaps overlap before it
-//! asks for keypoints. It holds how often each of 128 *words* occurs among the submap's descriptors; a word is the signs
-//! of seven fixed projections of a descriptor (locality-sensitive hashing). Descriptors are blind to rotation, hence so
-//! is the summary. Similarity is one minus the Hellinger distance of the two histograms, which are stored as square roots.
+//! asks for keypoints. It holds a histogram of each of the first 16 numbers of the descriptors of an even cover of the
+//! submap, 8 levels each, every descriptor shared between two levels. Descriptors are blind to rotation, hence so is
+//! the summary. Similarity is one minus the Hellinger distance of the histograms, which are stored as square roots.
 //!
-//! It ranks candidates, no more. Measured chance that an overlapping pair ranks above one without overlap: 0.92 between
-//! two streets (LiDAR), 0.5 to 0.6 between parts of one room or between halls furnished alike.
+//! It ranks candidates, no more. Measured average precision (that of chance in brackets): pairs of scans of two streets
+//! 0.9 (0.27), parts of eight halls furnished alike 0.5 (0.10). Histograms of single numbers did better than those of
+//! words (signs of seven numbers, 0.84 and 0.34), of means, and of second moments.
 
-use super::descriptor::DIMENSIONS;
-use super::features::Features;
-use super::thinning::hash_of;
+use super::descriptor::{Code, Projection};
 use thiserror::Error;
 
 /// Bytes of an encoded summary at most.
 pub const SUMMARY_LEN_MAX: usize = 400;
 
 /// Version of the layout.
-const VERSION: u8 = 1;
-/// Projections per word.
-const PROJECTIONS: usize = 7;
-/// Words.
-const WORDS: usize = 1 << PROJECTIONS;
-/// Version, words, voxel.
+const VERSION: u8 = 2;
+/// Numbers of a descriptor that are used.
+const NUMBERS: usize = 16;
+/// Levels of each.
+const LEVELS: usize = 8;
+/// Shares.
+const WORDS: usize = NUMBERS * LEVELS;
+/// Version, numbers, voxel.
 const HEADER_LEN: usize = 6;
 /// Bytes of an encoded summary.
 const LEN: usize = HEADER_LEN + WORDS;
@@ -37,9 +38,9 @@ const ROUNDING: f64 = 1.0 - 1e-9;
 pub struct Summary {
     /// Edge of the voxel the cloud was thinned to, frame units.
     voxel: f32,
-    /// Square roots of the words' shares, the largest 255; all zero for an empty submap.
+    /// Square roots of the levels' shares, number by number, the largest 255; all zero for an empty submap.
     words: [u8; WORDS],
-    /// Sum of the words' squares.
+    /// Sum of their squares.
     square: u32,
 }
 
@@ -53,29 +54,35 @@ pub enum SummaryError {
         len: usize,
     },
     /// A layout this code does not know.
-    #[error("summary of version {version} with 2^{projections} words: update the older robot")]
+    #[error("summary of version {version} with {numbers} histograms: update the older robot")]
     UnknownLayout {
         /// Layout version.
         version: u8,
-        /// Projections per word.
-        projections: u8,
+        /// Histograms.
+        numbers: u8,
     },
-    /// The voxel edge is not a usable number, or the histogram is not scaled to its largest word.
+    /// The voxel edge is not a usable number, or the histogram is not scaled to its largest share.
     #[error("summary is not in canonical form; its writer is faulty")]
     NotCanonical,
 }
 
 impl Summary {
-    /// The summary of a submap's features.
-    pub fn of(features: &Features) -> Self {
-        let projections = projections();
-        let mut counts = [0u32; WORDS];
-        for descriptor in features.descriptors() {
-            counts[word(&descriptor, &projections)] += 1;
+    /// The summary of a submap thinned to `voxel` (frame units), from descriptors that cover it evenly.
+    pub(super) fn of(voxel: f64, codes: &[Code]) -> Self {
+        let projection = Projection::new();
+        let mut shares = [0.0f32; WORDS];
+        for code in codes {
+            for (histogram, place) in shares.chunks_exact_mut(LEVELS).zip(projection.places(code, LEVELS)) {
+                let low = place.floor();
+                histogram[low as usize] += 1.0 - (place - low);
+                if let Some(next) = histogram.get_mut(low as usize + 1) {
+                    *next += place - low;
+                }
+            }
         }
-        let most = f64::from(counts.iter().copied().max().unwrap_or(0).max(1));
-        let words = counts.map(|count| (255.0 * (f64::from(count) / most).sqrt()).round() as u8);
-        Self::new(features.voxel() as f32, words)
+        let most = shares.iter().fold(f32::MIN_POSITIVE, |most, &share| most.max(share));
+        let words = shares.map(|share| (255.0 * (share / most).sqrt()).round() as u8);
+        Self::new(voxel as f32, words)
     }
 
     fn new(voxel: f32, words: [u8; WORDS]) -> Self {
@@ -106,7 +113,7 @@ impl Summary {
 
     /// The summary as bytes, at most [`SUMMARY_LEN_MAX`].
     pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = vec![VERSION, PROJECTIONS as u8];
+        let mut bytes = vec![VERSION, NUMBERS as u8];
         bytes.extend(self.voxel.to_le_bytes());
         bytes.extend(self.words);
         bytes
@@ -117,10 +124,10 @@ impl Summary {
     /// # Errors
     /// [`SummaryError`], naming the first check that failed.
     pub fn decode(bytes: &[u8]) -> Result<Self, SummaryError> {
-        if let [version, projections, ..] = *bytes
-            && (version, usize::from(projections)) != (VERSION, PROJECTIONS)
+        if let [version, numbers, ..] = *bytes
+            && (version, usize::from(numbers)) != (VERSION, NUMBERS)
         {
-            return Err(SummaryError::UnknownLayout { version, projections });
+            return Err(SummaryError::UnknownLayout { version, numbers });
         }
         let wrong_length = SummaryError::WrongLength { len: bytes.len() };
         let (header, words) = bytes.split_first_chunk::<HEADER_LEN>().ok_or(wrong_length.clone())?;
@@ -138,32 +145,6 @@ impl Summary {
 /// Exact in 32 bits, and a loop that vectorises: this runs for every pair of submaps.
 fn dot(a: &[u8; WORDS], b: &[u8; WORDS]) -> u32 {
     a.iter().zip(b).map(|(&a, &b)| u32::from(a) * u32::from(b)).sum()
-}
-
-/// Fixed projections: in each of the three histograms five bins count 1, five −1 and one 0, so that the sign compares one
-/// half of every histogram with the other.
-fn projections() -> [[i32; DIMENSIONS]; PROJECTIONS] {
-    core::array::from_fn(|p| {
-        let mut coefficients = [0; DIMENSIONS];
-        for (part, bins) in coefficients.chunks_exact_mut(DIMENSIONS / 3).enumerate() {
-            let mut order: Vec<usize> = (0..bins.len()).collect();
-            order.sort_by_key(|&bin| hash_of(&[p as i32, part as i32, bin as i32]));
-            for (rank, bin) in order.into_iter().enumerate() {
-                bins[bin] = match rank {
-                    0..=4 => 1,
-                    5..=9 => -1,
-                    _ => 0,
-                };
-            }
-        }
-        coefficients
-    })
-}
-
-fn word(descriptor: &[u8; DIMENSIONS], projections: &[[i32; DIMENSIONS]; PROJECTIONS]) -> usize {
-    let sign =
-        |p: &[i32; DIMENSIONS]| p.iter().zip(descriptor).map(|(c, &level)| c * i32::from(level)).sum::<i32>() > 0;
-    projections.iter().fold(0, |word, p| 2 * word + usize::from(sign(p)))
 }
 
 #[cfg(test)]

@@ -51,7 +51,7 @@ fn each_kind_of_damage_is_named() {
         bytes[at..at + with.len()].copy_from_slice(with);
         Summary::decode(&bytes).unwrap_err()
     };
-    assert_eq!(damaged(0, &[9]), SummaryError::UnknownLayout { version: 9, projections: PROJECTIONS as u8 });
+    assert_eq!(damaged(0, &[9]), SummaryError::UnknownLayout { version: 9, numbers: NUMBERS as u8 });
     for voxel in [f32::NAN, f32::INFINITY, 0.0, -0.1, 1e-5, 1e4] {
         assert_eq!(damaged(2, &voxel.to_le_bytes()), SummaryError::NotCanonical, "voxel {voxel}");
     }
@@ -65,7 +65,7 @@ proptest! {
     fn any_bytes_are_refused_or_come_back_the_same(mut bytes in prop::collection::vec(any::<u8>(), 0..2 * LEN), fix in any::<bool>()) {
         if fix && bytes.len() >= HEADER_LEN {
             bytes.resize(LEN, 3);
-            bytes[..2].copy_from_slice(&[VERSION, PROJECTIONS as u8]);
+            bytes[..2].copy_from_slice(&[VERSION, NUMBERS as u8]);
             bytes[2..HEADER_LEN].copy_from_slice(&0.1f32.to_le_bytes());
             bytes[HEADER_LEN] = 255;
             prop_assert!(Summary::decode(&bytes).is_ok());

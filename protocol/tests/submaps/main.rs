@@ -15,7 +15,7 @@ use nalgebra::Vector6;
 use world::World;
 
 /// Keypoints that fit a blob of 7 kB, and the default number.
-const SMALL: usize = 268;
+const SMALL: usize = 332;
 const DEFAULT: usize = 384;
 
 #[test]

@@ -9,6 +9,7 @@ pub mod graph;
 pub mod outliers;
 pub mod peer;
 pub mod peers;
+pub mod places;
 pub mod registration;
 pub mod row;
 pub mod share;
@@ -38,6 +39,11 @@ pub enum Bench {
     /// Exit code 1 if a graph did not converge, was not certified, or missed its known optimum; 2 if a file cannot be
     /// used.
     Graph(graph::GraphBench),
+    /// Seeing the same place on recorded data: alignments, candidates, bytes and time, beside KISS-Matcher
+    ///
+    /// Alignments are one way: one submap's keypoints against the other's features. Times are of the processor. Exit code 1
+    /// if a wrong alignment was accepted or fewer were found than promised, 2 if the data cannot be used.
+    Places(places::Places),
     /// Pose graphs split among robots who share their measurements: bytes sent until all have the whole optimum
     ///
     /// Exit code 1 if a robot's minimum is not that of the whole graph (1e-9), or robots differ; 2 if a file cannot be
@@ -71,6 +77,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Registration(options) => registration::run(&options),
         Bench::Gossip(options) => gossip::run(&options),
         Bench::Graph(options) => graph::run(&options),
+        Bench::Places(options) => places::run(&options),
         Bench::Share(options) => share::run(&options),
         Bench::Flood(options) => flood::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),

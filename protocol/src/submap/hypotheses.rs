@@ -1,0 +1,195 @@
+//! Poses worth a look, from matches of which one in two hundred may be right. Two matches of oriented points determine a
+//! pose and over-determine it fourfold: the distance, each normal's angle with the line between, and the angle between
+//! the normals must agree. Pairs of matches that do are ranked by how many further matches agree with both
+//! (second-order compatibility, Chen et al. 2022), and polished on those. Lengths are in voxels.
+
+use super::matching::Pairing;
+use super::scene::{Cloud, Pose};
+use nalgebra::{Matrix3, Matrix4, Vector3};
+
+/// Distances of a pair agree within this.
+const LENGTH_TOLERANCE: f64 = 1.5;
+/// Matches nearer to each other than this say little of the rotation.
+const LENGTH_MIN: f64 = 4.0;
+/// Cosines of a pair agree within this.
+const COSINE_TOLERANCE: f64 = 0.3;
+/// Pairs that become poses at most.
+const POSES_MAX: usize = 2000;
+/// Pairs ranked at most; matches of the last keypoints are left out beyond it.
+const PAIRS_MAX: usize = 400_000;
+/// Two poses that place everything within this distance and angle (rad) are one.
+const SAME: (f64, f64) = (1.0, 0.05);
+/// A normal counts as much as a point this far away.
+const LEVER: f64 = 4.0;
+/// Matches within this of a pose polish it.
+const POLISH: f64 = 3.0;
+/// Rounds of polishing.
+const POLISH_ROUNDS: usize = 2;
+
+/// Distinct poses, the one with the most agreement first.
+pub fn hypotheses(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Vec<Pose> {
+    let agreement = Agreement::of(theirs, mine, matches);
+    let mut poses: Vec<Pose> = Vec::new();
+    let mut explained = vec![[0_u64; POSES_MAX.div_ceil(64)]; matches.len()];
+    let mut members: Vec<Pairing> = Vec::new();
+    let middle = theirs.points.iter().sum::<Vector3<f64>>() / theirs.points.len().max(1) as f64;
+    for (x, y) in agreement.ranked().into_iter().take(POSES_MAX) {
+        let (x, y) = (x as usize, y as usize);
+        // What an earlier pose explains leads to it again.
+        if explained[x].iter().zip(&explained[y]).any(|(a, b)| a & b != 0) {
+            continue;
+        }
+        members.clear();
+        members.extend([x, y].into_iter().chain(agreement.common(x, y)).map(|k| matches[k]));
+        let Some(pose) = polished(theirs, mine, &members) else { continue };
+        if poses.iter().all(|other| pose.differs(other, &middle, SAME.0, SAME.1)) {
+            for k in [x, y].into_iter().chain(agreement.common(x, y)) {
+                if explains(&pose, theirs, mine, &matches[k]) {
+                    explained[k][poses.len() / 64] |= 1 << (poses.len() % 64);
+                }
+            }
+            poses.push(pose);
+        }
+    }
+    poses
+}
+
+/// Which matches agree with which.
+struct Agreement {
+    /// Words of a row.
+    words: usize,
+    /// A bit for each match, row by row.
+    bits: Vec<u64>,
+    pairs: Vec<(u32, u32)>,
+}
+
+impl Agreement {
+    fn of(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Self {
+        let words = matches.len().div_ceil(64);
+        let mut agreement = Self { words, bits: vec![0; words * matches.len()], pairs: Vec::new() };
+        for (x, first) in matches.iter().enumerate() {
+            for (y, second) in matches.iter().enumerate().skip(x + 1) {
+                if agree(theirs, mine, first, second) {
+                    agreement.bits[x * words + y / 64] |= 1 << (y % 64);
+                    agreement.bits[y * words + x / 64] |= 1 << (x % 64);
+                    agreement.pairs.push((x as u32, y as u32));
+                }
+            }
+            if agreement.pairs.len() > PAIRS_MAX {
+                break;
+            }
+        }
+        agreement
+    }
+
+    fn row(&self, x: usize) -> &[u64] {
+        &self.bits[x * self.words..(x + 1) * self.words]
+    }
+
+    /// Matches that agree with both.
+    fn common(&self, x: usize, y: usize) -> impl Iterator<Item = usize> {
+        let both = self.row(x).iter().zip(self.row(y)).map(|(a, b)| a & b).enumerate();
+        both.flat_map(|(word, bits)| (0..64).filter(move |bit| bits >> bit & 1 == 1).map(move |bit| 64 * word + bit))
+    }
+
+    /// The pairs, those with the most in common first.
+    fn ranked(&self) -> Vec<(u32, u32)> {
+        let common = |&(x, y): &(u32, u32)| -> u32 {
+            self.row(x as usize).iter().zip(self.row(y as usize)).map(|(a, b)| (a & b).count_ones()).sum()
+        };
+        let mut ranked: Vec<_> = self.pairs.iter().map(|pair| (core::cmp::Reverse(common(pair)), *pair)).collect();
+        ranked.sort_unstable();
+        ranked.into_iter().map(|(_, pair)| pair).collect()
+    }
+}
+
+/// Whether one motion may take both points to their counterparts.
+fn agree(theirs: &Cloud, mine: &Cloud, first: &Pairing, second: &Pairing) -> bool {
+    if first.their == second.their || first.my == second.my {
+        return false;
+    }
+    let [t1, t2] = [first.their, second.their].map(|k| k as usize);
+    let [m1, m2] = [first.my, second.my].map(|k| k as usize);
+    let (dt, dm) = (theirs.points[t2] - theirs.points[t1], mine.points[m2] - mine.points[m1]);
+    let (lt, lm) = (dt.norm(), dm.norm());
+    if (lt - lm).abs() > LENGTH_TOLERANCE || lt < LENGTH_MIN || lm < LENGTH_MIN {
+        return false;
+    }
+    let (n1, n2) = (&theirs.normals[t1], &theirs.normals[t2]);
+    let (k1, k2) = (&mine.normals[m1], &mine.normals[m2]);
+    (n1.dot(n2) - k1.dot(k2)).abs() <= COSINE_TOLERANCE
+        && (n1.dot(&dt) / lt - k1.dot(&dm) / lm).abs() <= COSINE_TOLERANCE
+        && (n2.dot(&dt) / lt - k2.dot(&dm) / lm).abs() <= COSINE_TOLERANCE
+}
+
+/// The pose of the first two matches, then of all that are near it.
+fn polished(theirs: &Cloud, mine: &Cloud, members: &[Pairing]) -> Option<Pose> {
+    let mut pose = least_squares(theirs, mine, members.get(..2)?)?;
+    let mut near = Vec::with_capacity(members.len());
+    for _ in 0..POLISH_ROUNDS {
+        near.clear();
+        near.extend(members.iter().filter(|p| explains(&pose, theirs, mine, p)).copied());
+        if near.len() >= 2 {
+            pose = least_squares(theirs, mine, &near)?;
+        }
+    }
+    Some(pose)
+}
+
+/// Whether the pose takes a match's ends near to each other.
+fn explains(pose: &Pose, theirs: &Cloud, mine: &Cloud, pairing: &Pairing) -> bool {
+    let aside = pose.apply(&theirs.points[pairing.their as usize]) - mine.points[pairing.my as usize];
+    aside.norm_squared() <= POLISH * POLISH
+}
+
+/// The least-squares motion of points and normals (Horn's quaternion method).
+fn least_squares(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Option<Pose> {
+    let count = matches.len() as f64;
+    let ends = || matches.iter().map(|p| (p.their as usize, p.my as usize));
+    let from = ends().map(|(t, _)| theirs.points[t]).sum::<Vector3<f64>>() / count;
+    let to = ends().map(|(_, m)| mine.points[m]).sum::<Vector3<f64>>() / count;
+    let product = |(t, m): (usize, usize)| {
+        (theirs.points[t] - from) * (mine.points[m] - to).transpose()
+            + theirs.normals[t] * mine.normals[m].transpose() * (LEVER * LEVER)
+    };
+    let rotation = rotation_of(&ends().map(product).sum())?;
+    Some(Pose { rotation, translation: to - rotation * from })
+}
+
+/// The rotation that maximises tr(R H), H = Σ p qᵀ: the top eigenvector of Horn's 4×4 matrix, by repeated squaring.
+fn rotation_of(h: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+    let (xx, xy, xz) = (h[(0, 0)], h[(0, 1)], h[(0, 2)]);
+    let (yx, yy, yz) = (h[(1, 0)], h[(1, 1)], h[(1, 2)]);
+    let (zx, zy, zz) = (h[(2, 0)], h[(2, 1)], h[(2, 2)]);
+    #[rustfmt::skip]
+    let horn = Matrix4::new(
+        xx + yy + zz, yz - zy,      zx - xz,       xy - yx,
+        yz - zy,      xx - yy - zz, xy + yx,       zx + xz,
+        zx - xz,      xy + yx,      -xx + yy - zz, yz + zy,
+        xy - yx,      zx + xz,      yz + zy,       -xx - yy + zz,
+    );
+    // Shifted, so that the largest eigenvalue is the largest in size too.
+    let size = horn.norm();
+    if !(size > 0.0 && size.is_finite()) {
+        return None;
+    }
+    let mut power = horn / size + Matrix4::identity();
+    for _ in 0..SQUARINGS {
+        power = power * power;
+        power /= power.norm();
+    }
+    let v = power
+        .column(power.column_iter().map(|c| c.norm_squared()).enumerate().max_by(|a, b| a.1.total_cmp(&b.1))?.0)
+        .normalize();
+    let (w, x, y, z) = (v[0], v[1], v[2], v[3]);
+    #[rustfmt::skip]
+    let rotation = Matrix3::new(
+        w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z,
+    );
+    Some(rotation)
+}
+
+/// The eigenvalue's share grows to its 2¹⁰th power.
+const SQUARINGS: usize = 10;

@@ -1,0 +1,61 @@
+//! Seeing the same place on recorded data: alignments of submaps that overlap and of such that do not, candidates by
+//! their summaries, bytes and time, beside KISS-Matcher. The sets and rules are those the design was measured on: ten
+//! submaps of five depth images of one room (7-Scenes), five LiDAR scans along a street (KITTI 07), five of another
+//! (KITTI 00). Every submap starts in a frame of random orientation.
+
+mod candidates;
+mod files;
+mod measure;
+mod peer;
+mod sets;
+mod table;
+
+use crate::bar::progress_bar;
+use clap::Args;
+use std::io::Write;
+use std::path::PathBuf;
+
+/// What to measure.
+#[derive(Debug, Args)]
+pub struct Places {
+    /// Folder that holds rgbd_7scenes, lidar_gtsam_points, kitti00_scans and kitti_poses_lidar
+    #[arg(long, value_name = "DIR")]
+    pub data: PathBuf,
+    /// Keypoints sent one way: 332 are 7.0 kB
+    #[arg(long, default_value_t = 332, value_parser = clap::value_parser!(u16).range(16..=1024))]
+    pub keypoints: u16,
+    /// The first seed of the random orientations
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Runs, each with the next seed
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100))]
+    pub runs: u64,
+    /// Measure KISS-Matcher on the same LiDAR pairs, in this Python interpreter
+    #[arg(long, value_name = "PYTHON")]
+    pub peer_python: Option<PathBuf>,
+    /// KISS-Matcher's voxel, m; its own default is 0.3
+    #[arg(long, default_value_t = 0.3)]
+    pub peer_voxel: f64,
+}
+
+/// Measures and prints. Returns whether nothing wrong was accepted and as much was found as promised.
+///
+/// # Errors
+/// Data or an interpreter that cannot be used.
+pub fn run(options: &Places) -> anyhow::Result<bool> {
+    let mut good = true;
+    for seed in options.seed..options.seed + options.runs {
+        let sets = sets::load(&options.data, usize::from(options.keypoints), seed)?;
+        let bar = progress_bar(measure::pairs(&sets).len() as u64, "pairs")?;
+        let tried = measure::all(&sets, || bar.inc(1))?;
+        bar.finish_and_clear();
+        let peers = match &options.peer_python {
+            Some(python) => peer::measure(python, options.peer_voxel, &sets, &tried)?,
+            None => Vec::new(),
+        };
+        let outcome = table::Outcome { seed, sets: &sets, tried: &tried, peers: &peers };
+        write!(std::io::stdout().lock(), "{outcome}")?;
+        good &= outcome.is_good();
+    }
+    Ok(good)
+}

@@ -1,0 +1,176 @@
+//! The recorded sets as described submaps with true poses.
+
+use super::files;
+use crate::bench::cpu::thread_seconds;
+use anyhow::Context;
+use merganser_protocol::config::SubmapConfig;
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use merganser_protocol::submap::{CovarianceOf, Described, Keyframe, Submap, SubmapBuilder, describe};
+use merganser_protocol::time::Stamp;
+use nalgebra::Vector3;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// A described submap.
+pub(super) struct Place {
+    /// Its number in the set's own counting.
+    pub name: String,
+    /// What is known of it.
+    pub described: Described,
+    /// The truth.
+    pub t_world_anchor: Se3,
+    /// Processor time to thin and to describe it, s.
+    pub thin_s: f64,
+    /// See above.
+    pub describe_s: f64,
+    /// The single scan it is made of, as recorded, for peers.
+    pub scan: Option<Scan>,
+}
+
+/// A recorded scan and how it was turned.
+pub(super) struct Scan {
+    /// Little-endian f32.
+    pub path: std::path::PathBuf,
+    /// Floats a point.
+    pub stride: usize,
+    /// Turns its points into the body frame used here.
+    pub turn: So3,
+}
+
+/// Submaps of one world and sensor.
+pub(super) struct Set {
+    /// Its name.
+    pub name: &'static str,
+    /// Its submaps.
+    pub places: Vec<Place>,
+    /// An alignment is right within this angle...
+    pub rotation_deg: f64,
+    /// ...and distance.
+    pub translation_m: f64,
+    /// Directions to find at least, of those that overlap by a quarter.
+    pub found_min: usize,
+}
+
+/// Loads all sets; each submap's body is turned at random.
+pub(super) fn load(data: &Path, keypoints: usize, seed: u64) -> anyhow::Result<Vec<Set>> {
+    let mut maker = Maker { keypoints, rng: ChaCha8Rng::seed_from_u64(seed) };
+    Ok(vec![maker.seven_scenes(data)?, maker.kitti07(data)?, maker.kitti00(data)?])
+}
+
+struct Maker {
+    keypoints: usize,
+    rng: ChaCha8Rng,
+}
+
+impl Maker {
+    /// 10 submaps of 5 depth images each.
+    fn seven_scenes(&mut self, data: &Path) -> anyhow::Result<Set> {
+        let folder = data.join("rgbd_7scenes");
+        let poses: BTreeMap<usize, Se3> = files::text(&folder.join("poses_all_1000.txt"))?
+            .lines()
+            .map(files::indexed_matrix)
+            .collect::<Result<_, _>>()?;
+        let mut places = Vec::new();
+        for first in (0..1000).step_by(100) {
+            let mut keyframes = Vec::new();
+            for frame in (first..first + 100).step_by(20) {
+                let pose = *poses.get(&frame).with_context(|| format!("no pose of frame {frame}"))?;
+                keyframes.push((pose, files::depth_image(&folder.join(format!("frame-{frame:06}.depth.png")))?));
+            }
+            places.push(self.place((first / 100).to_string(), 0.05, keyframes)?.0);
+        }
+        Ok(Set { name: "7scenes", places, rotation_deg: 15.0, translation_m: 0.3, found_min: 76 })
+    }
+
+    /// 5 scans, each a submap.
+    fn kitti07(&mut self, data: &Path) -> anyhow::Result<Set> {
+        let folder = data.join("lidar_gtsam_points/kitti_07_dump");
+        let mut places = Vec::new();
+        for line in files::text(&folder.join("graph.txt"))?.lines() {
+            let (k, pose) = files::indexed_pose(line)?;
+            places.push(self.scan(k.to_string(), pose, folder.join(format!("{k:06}/points.bin")), 3)?);
+        }
+        Ok(Set { name: "kitti07", places, rotation_deg: 5.0, translation_m: 2.0, found_min: 17 })
+    }
+
+    /// 5 scans of another street.
+    fn kitti00(&mut self, data: &Path) -> anyhow::Result<Set> {
+        let text = files::text(&data.join("kitti_poses_lidar/kitti00.txt.xz"))?;
+        let mut places = Vec::new();
+        for k in [0, 5, 94, 198, 199] {
+            let (_, pose) = files::indexed_pose(text.lines().nth(k).context("kitti00.txt.xz is cut")?)?;
+            places.push(self.scan(k.to_string(), pose, data.join(format!("kitti00_scans/{k:06}.bin")), 4)?);
+        }
+        Ok(Set { name: "kitti00", places, rotation_deg: 5.0, translation_m: 2.0, found_min: 4 })
+    }
+
+    fn scan(&mut self, name: String, pose: Se3, path: std::path::PathBuf, stride: usize) -> anyhow::Result<Place> {
+        let points = files::points(&path, stride)?;
+        let (place, turn) = self.place(name, 0.5, vec![(pose, points)])?;
+        Ok(Place { scan: Some(Scan { path, stride, turn }), ..place })
+    }
+
+    /// A submap of keyframes at true poses, whose body is turned.
+    fn place(
+        &mut self,
+        name: String,
+        voxel_m: f64,
+        keyframes: Vec<(Se3, Vec<[f32; 3]>)>,
+    ) -> anyhow::Result<(Place, So3)> {
+        let turn = self.turn();
+        let back = Se3::new(turn.inverse(), Vector3::zeros());
+        let turned = |p: [f32; 3]| -> [f32; 3] { (turn * Vector3::from(p.map(f64::from))).map(|x| x as f32).into() };
+        let keyframes: Vec<(Se3, Vec<[f32; 3]>)> = keyframes
+            .into_iter()
+            .map(|(pose, points)| (pose * back, points.into_iter().map(turned).collect()))
+            .collect();
+        let config = self.config(voxel_m);
+        let start = thread_seconds();
+        let submap = build(&config, &keyframes)?;
+        let thinned = thread_seconds();
+        let described = describe(&submap, &config);
+        let done = thread_seconds();
+        // The builder was told true poses: its anchor's is one of them.
+        let t_world_anchor = submap.t_frame_anchor;
+        let (thin_s, describe_s) = (thinned - start, done - thinned);
+        Ok((Place { name, described, t_world_anchor, thin_s, describe_s, scan: None }, turn))
+    }
+
+    fn config(&self, voxel_m: f64) -> SubmapConfig {
+        SubmapConfig {
+            voxel_m,
+            keyframes_max: 10_000,
+            distance_m: 1e3,
+            rotation_deg: 1e6,
+            keypoints: self.keypoints,
+            ..Default::default()
+        }
+    }
+
+    /// Uniform over all rotations.
+    fn turn(&mut self) -> So3 {
+        loop {
+            let q: [f64; 4] =
+                core::array::from_fn(|_| f64::from(self.rng.next_u32()) / f64::from(u32::MAX) * 2.0 - 1.0);
+            let norm = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+            if (0.1..=1.0).contains(&norm)
+                && let Some(turn) = So3::from_xyzw(q.map(|x| x / norm))
+            {
+                return turn;
+            }
+        }
+    }
+}
+
+fn build(config: &SubmapConfig, keyframes: &[(Se3, Vec<[f32; 3]>)]) -> anyhow::Result<Submap> {
+    let mut builder = SubmapBuilder::new(config.clone());
+    for (k, (pose, points)) in (1..).zip(keyframes) {
+        let covariance = Covariance::from_sigmas([0.01; 6])?;
+        let pose = PoseWithCovariance { pose: *pose, covariance };
+        let (stamp, covariance_of) = (Stamp(k), CovarianceOf::Motion);
+        builder.push(Keyframe { stamp, pose, covariance_of, points: points.clone() })?;
+    }
+    builder.flush().context("no keyframes")
+}

@@ -1,0 +1,204 @@
+//! What was measured, as text, and whether it is good enough.
+
+use super::candidates::ranking;
+use super::measure::{At, OVERLAP_FOUND, OVERLAP_NONE, Tried, place};
+use super::peer::Peer;
+use super::sets::Set;
+use core::fmt::{Display, Formatter, Result};
+
+/// Pairs that overlap a little, too little to be sure: by set and names.
+const HARD: [(&str, &str, &str); 2] = [("kitti00", "94", "198"), ("kitti00", "5", "94")];
+/// 95 % quantile of χ² with 6 degrees of freedom.
+const CHI2_6_95: f64 = 12.592;
+
+/// All that one run gave.
+pub(super) struct Outcome<'a> {
+    pub seed: u64,
+    pub sets: &'a [Set],
+    pub tried: &'a [Tried],
+    pub peers: &'a [Peer],
+}
+
+/// Whether a pair is one of those to be refused though they overlap.
+pub(super) fn is_hard(sets: &[Set], tried: &Tried) -> bool {
+    let (a, b) = (place(sets, tried.their), place(sets, tried.mine));
+    let named = |(set, x, y): &(&str, &str, &str)| {
+        sets[tried.their.0].name == *set && ((a.name == *x && b.name == *y) || (a.name == *y && b.name == *x))
+    };
+    tried.their.0 == tried.mine.0 && HARD.iter().any(named)
+}
+
+impl Outcome<'_> {
+    /// As much found as promised, and nothing wrong.
+    pub(super) fn is_good(&self) -> bool {
+        let found = |(k, set): (usize, &Set)| self.to_find(k).filter(|t| t.is_right).count() >= set.found_min;
+        self.tried.iter().all(|t| t.answer.is_err() || t.is_right)
+            && self.tried.iter().all(|t| t.answer.is_err() || !is_hard(self.sets, t))
+            && self.sets.iter().enumerate().all(found)
+    }
+
+    fn to_find(&self, set: usize) -> impl Iterator<Item = &Tried> {
+        self.tried.iter().filter(move |t| t.their.0 == set && t.mine.0 == set && t.overlap >= OVERLAP_FOUND)
+    }
+
+    fn alignments(&self, f: &mut Formatter<'_>) -> Result {
+        writeln!(
+            f,
+            "{:<9} {:>5} {:>5} {:>5} {:>5} {:>8} {:>8} {:>8} {:>9} {:>6} {:>8} {:>8}",
+            "overlap",
+            "tried",
+            "found",
+            "wrong",
+            "none",
+            "recall",
+            "rot °",
+            "trans m",
+            "NEES",
+            "in 95%",
+            "cpu ms",
+            "max"
+        )?;
+        for (k, set) in self.sets.iter().enumerate() {
+            self.row(f, set.name, &self.to_find(k).collect::<Vec<_>>())?;
+        }
+        let little = |t: &&Tried| t.overlap < OVERLAP_FOUND && t.overlap >= OVERLAP_NONE;
+        self.row(f, "little", &self.tried.iter().filter(little).collect::<Vec<_>>())?;
+        self.row(f, "none", &self.tried.iter().filter(|t| t.overlap < OVERLAP_NONE).collect::<Vec<_>>())?;
+        let strangers =
+            self.tried.iter().filter(|t| t.overlap < OVERLAP_FOUND && place(self.sets, t.their).scan.is_some());
+        let strangers: Vec<_> = strangers.collect();
+        let wrong = strangers.iter().filter(|t| t.answer.is_ok() && !t.is_right).count();
+        writeln!(f, "LiDAR pairs below a quarter: {} tried, {wrong} wrongly accepted", strangers.len())?;
+        for t in self.tried.iter().filter(|t| is_hard(self.sets, t)) {
+            let (a, b) = (&place(self.sets, t.their).name, &place(self.sets, t.mine).name);
+            let said = t.answer.as_ref().map_or_else(|reason| format!("refused: {reason}"), |_| "ACCEPTED".into());
+            writeln!(f, "  {a}–{b}, {:.0} % overlap: {said}", 100.0 * t.overlap)?;
+        }
+        for t in self.tried.iter().filter(|t| !t.is_right && (t.overlap >= OVERLAP_FOUND || t.answer.is_ok())) {
+            let named = |at: At| format!("{} {}", self.sets[at.0].name, place(self.sets, at).name);
+            let said = match &t.answer {
+                Err(reason) => format!("missed: {reason}"),
+                Ok(found) => format!(
+                    "WRONG: score {:.0}, support {:.0}, fit {:.2}, contradiction {:.3}",
+                    found.score, found.support, found.fit, found.contradiction
+                ),
+            };
+            writeln!(f, "  {} – {}, {:.0} % overlap: {said}", named(t.their), named(t.mine), 100.0 * t.overlap)?;
+        }
+        Ok(())
+    }
+
+    fn row(&self, f: &mut Formatter<'_>, name: &str, of: &[&Tried]) -> Result {
+        let found: Vec<_> = of.iter().filter(|t| t.is_right).collect();
+        let wrong = of.iter().filter(|t| t.answer.is_ok() && !t.is_right).count();
+        let of_found = |value: fn(&Tried) -> Option<f64>| found.iter().filter_map(|t| value(t)).collect::<Vec<f64>>();
+        let nees = of_found(|t| t.nees);
+        let inside = nees.iter().filter(|&&n| n <= CHI2_6_95).count();
+        let seconds: Vec<f64> = of.iter().map(|t| t.seconds * 1e3).collect();
+        writeln!(
+            f,
+            "{name:<9} {:>5} {:>5} {wrong:>5} {:>5} {:>7.1}% {:>8.2} {:>8.3} {:>9.2} {:>5.0}% {:>8.0} {:>8.0}",
+            of.len(),
+            found.len(),
+            of.len() - found.len() - wrong,
+            percent(found.len(), of.len()),
+            median(&of_found(|t| Some(t.error?.0))),
+            median(&of_found(|t| Some(t.error?.1))),
+            nees.iter().sum::<f64>() / nees.len() as f64,
+            percent(inside, nees.len()),
+            median(&seconds),
+            seconds.iter().fold(0.0, |a: f64, &b| a.max(b)),
+        )
+    }
+
+    fn candidates(&self, f: &mut Formatter<'_>) -> Result {
+        let lidar: Vec<usize> =
+            (0..self.sets.len()).filter(|&k| self.sets[k].places.iter().all(|p| p.scan.is_some())).collect();
+        let rooms: Vec<usize> = (0..self.sets.len()).filter(|k| !lidar.contains(k)).collect();
+        writeln!(f, "candidates  pairs  to find  recall at 100 % precision  precision–recall area (chance)")?;
+        for (name, of) in [("two streets", &lidar), ("one room", &rooms)] {
+            let r = ranking(self.sets, self.tried, of);
+            let all = r.positives + r.negatives;
+            writeln!(
+                f,
+                "{name:<11} {all:>5} {:>8} {:>26.2} {:>22.2} ({:.2})",
+                r.positives,
+                r.recall_at_full_precision,
+                r.area,
+                r.positives as f64 / all.max(1) as f64
+            )?;
+        }
+        Ok(())
+    }
+
+    fn costs(&self, f: &mut Formatter<'_>) -> Result {
+        writeln!(f, "submaps    points  summary B  keypoints B  extra B  thin ms  describe ms  µs a point")?;
+        for set in self.sets {
+            let of =
+                |value: fn(&super::sets::Place) -> f64| median(&set.places.iter().map(value).collect::<Vec<f64>>());
+            writeln!(
+                f,
+                "{:<9} {:>7.0} {:>10.0} {:>12.0} {:>8} {:>8.1} {:>12.1} {:>11.2}",
+                set.name,
+                of(|p| p.described.features.len() as f64),
+                of(|p| p.described.summary.encode().len() as f64),
+                of(|p| p.described.keypoints.encode().len() as f64),
+                0,
+                of(|p| p.thin_s * 1e3),
+                of(|p| p.describe_s * 1e3),
+                of(|p| p.describe_s * 1e6 / p.described.features.len() as f64),
+            )?;
+        }
+        Ok(())
+    }
+
+    fn compared(&self, f: &mut Formatter<'_>) -> Result {
+        if self.peers.is_empty() {
+            return Ok(());
+        }
+        writeln!(f, "KITTI pair      ours rot ° trans m   cpu ms | KISS-Matcher rot ° trans m   cpu ms  wall ms")?;
+        for peer in self.peers {
+            let (a, b) = peer.pair;
+            let name = format!("{} {}–{}", self.sets[a.0].name, place(self.sets, a).name, place(self.sets, b).name);
+            let Some(ours) = self.tried.iter().find(|t| (t.their, t.mine) == (a, b)) else { continue };
+            let error = |error: Option<(f64, f64)>| {
+                error.map_or_else(|| format!("{:>10} {:>7}", "refused", ""), |(deg, m)| format!("{deg:>10.2} {m:>7.3}"))
+            };
+            let said = error(peer.valid.then_some(peer.error));
+            writeln!(
+                f,
+                "{name:<15} {} {:>8.0} | {said:>31} {:>8.0} {:>8.0}",
+                error(ours.error),
+                self.both_described(a, b) * 1e3 + ours.seconds * 1e3,
+                peer.cpu_s * 1e3,
+                peer.wall_s * 1e3,
+            )?;
+        }
+        Ok(())
+    }
+
+    /// Time from two raw clouds to two descriptions, s.
+    fn both_described(&self, a: At, b: At) -> f64 {
+        [a, b].map(|at| place(self.sets, at)).iter().map(|p| p.thin_s + p.describe_s).sum()
+    }
+}
+
+impl Display for Outcome<'_> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> Result {
+        writeln!(f, "seed {}", self.seed)?;
+        self.alignments(f)?;
+        self.candidates(f)?;
+        self.costs(f)?;
+        self.compared(f)
+    }
+}
+
+fn percent(part: usize, of: usize) -> f64 {
+    100.0 * part as f64 / of.max(1) as f64
+}
+
+fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
+}
