@@ -67,7 +67,8 @@ pub enum Seen<'a> {
     Damaged,
     /// From now on there may be two histories of this robot's logs, by no fault of the core.
     MayFork(RobotId),
-    /// From now on entries may come with this robot's signature that its core did not write.
+    /// From now on entries may come with this robot's signature that its core did not write: by a forger who has its
+    /// key, or by a twin, who may even write the very same.
     Forges(RobotId),
 }
 
@@ -144,7 +145,7 @@ impl Checks {
             Box::new(sound_numbers::SoundNumbers),
             Box::new(no_false_merge::NoFalseMerge),
             Box::new(honest_covariance::HonestCovariance),
-            Box::new(converged::Converged),
+            Box::<converged::Converged>::default(),
             Box::new(merged_as_expected::MergedAsExpected),
         ])
     }

@@ -158,7 +158,8 @@ impl<C: Core> Swarm<C> {
             Fault::Equivocate { .. } => {
                 self.robots[robot].equivocates = true;
                 self.doubt(robot);
-                self.see(robot, &Seen::Forges(self.robots[robot].id));
+                let id = self.robots[robot].id;
+                self.see(robot, &Seen::Forges(id));
             }
             Fault::OtherVersion { .. } => self.robots[robot].other_version = true,
             Fault::Flood { .. } => self.queue.push(now, Event::Flood(index)),
@@ -257,6 +258,8 @@ impl<C: Core> Swarm<C> {
         self.robots[twin].gone = false;
         self.counts.twins += 1;
         self.doubt(of);
+        let id = self.robots[of].id;
+        self.see(of, &Seen::Forges(id));
         self.queue.push(now, Event::Boot { robot: twin });
     }
 
