@@ -4,6 +4,9 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+/// A pose on a link, bytes (DESIGN §5).
+const POSE_BYTES: f64 = 160.0;
+
 /// The core's configuration. Lengths are in metres, times in seconds, angles in degrees where the name says so.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -132,6 +135,11 @@ pub struct GossipConfig {
     pub delta_bytes_max: usize,
     /// Bytes of keypoint blobs asked for per second at most: leave room for poses and facts on the slowest link.
     pub blob_bytes_per_sec: f64,
+    /// Bytes that this robot sends per second at most, a broadcast counted once; hence no link carries more from it.
+    /// Poses come first, then new facts, then repair, then announcements and questions, and blobs take what is left.
+    /// Choose about half of what the slowest link carries; poses (about 160 B each, every `pose_secs`) may take half
+    /// of this at most.
+    pub link_bytes_per_sec: f64,
     /// How long an unanswered question is waited for.
     pub answer_secs: f64,
     /// Entries of our own log from which on it is replaced by what still counts of it; 0 for never.
@@ -149,6 +157,7 @@ impl Default for GossipConfig {
             pose_secs: 0.5,
             delta_bytes_max: 64 * 1024,
             blob_bytes_per_sec: 250_000.0,
+            link_bytes_per_sec: 1_000_000.0,
             answer_secs: 2.0,
             condense_entries: 1_000,
             entries_per_frame_max: 100_000,
@@ -206,6 +215,10 @@ impl Config {
         range("gossip.pose_secs", g.pose_secs, 0.01, 3600.0, "use 0.01 to 3600 s")?;
         range("gossip.delta_bytes_max", g.delta_bytes_max as f64, 4096.0, 65536.0, "use 4096 to 65536 bytes")?;
         range("gossip.blob_bytes_per_sec", g.blob_bytes_per_sec, 1e3, 1e9, "use 1000 to 1e9 bytes per second")?;
+        range("gossip.link_bytes_per_sec", g.link_bytes_per_sec, 2e3, 1e9, "use 2000 to 1e9 bytes per second")?;
+        let poses = 2.0 * POSE_BYTES / g.pose_secs;
+        let mend = "poses alone would take more than half of it; raise it, or gossip.pose_secs";
+        range("gossip.link_bytes_per_sec", g.link_bytes_per_sec, poses, 1e9, mend)?;
         range("gossip.answer_secs", g.answer_secs, 0.01, 600.0, "use 0.01 to 600 s")?;
         range("gossip.condense_entries", f64::from(g.condense_entries), 0.0, 1e7, "use 0 (never) to 10000000")?;
         range("gossip.entries_per_frame_max", f64::from(g.entries_per_frame_max), 1.0, 1e7, "use 1 to 10000000")?;

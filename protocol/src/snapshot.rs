@@ -239,6 +239,10 @@ pub struct StatsView {
     pub rejected_by_peer: BTreeMap<String, u64>,
     /// Alignments tried here, found, refused, agreed, disputed; solves.
     pub work: BTreeMap<String, u64>,
+    /// What `gossip.link_bytes_per_sec` held back, by class: new entries that waited, answers put off, turns to announce
+    /// or ask that waited.
+    #[serde(default)]
+    pub held_back: BTreeMap<String, u64>,
 }
 
 impl From<&Sim3> for PoseView {

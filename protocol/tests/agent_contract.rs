@@ -308,16 +308,21 @@ fn a_restart_resumes_the_log_where_it_was_durable() {
     assert_eq!(wires.agents[1].digest(), wires.agents[0].digest(), "the peer accepts what the second life wrote");
 }
 
-#[test]
-fn a_lost_store_begins_a_new_epoch_above_what_peers_remember() {
-    let (keyframes, _) = drive(&World::new(1), 0, 8);
+/// Alpha has written an epoch, and beta holds it as well.
+fn two_who_know_an_epoch(fresh_epoch: u32) -> Wires {
     let mut wires =
-        Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 5 }), agent(1, Restored::default())]);
-    for keyframe in &keyframes {
-        wires.input(0, Input::Keyframe(keyframe.clone()));
+        Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch }), agent(1, Restored::default())]);
+    for keyframe in drive(&World::new(1), 0, 8).0 {
+        wires.input(0, Input::Keyframe(keyframe));
     }
     wires.run(Duration::from_secs(2));
     assert_eq!(wires.agents[1].digest(), wires.agents[0].digest());
+    wires
+}
+
+#[test]
+fn a_lost_store_begins_a_new_epoch_above_what_peers_remember() {
+    let mut wires = two_who_know_an_epoch(5);
     // The clock stood at an earlier date when the store was made anew: the epoch must still rise.
     wires.agents[0] = agent(0, Restored { records: vec![], fresh_epoch: 3 });
     wires.input(0, Input::Neighbour { robot: robot(1), up: true });
@@ -330,13 +335,7 @@ fn a_lost_store_begins_a_new_epoch_above_what_peers_remember() {
 /// third took that part for a log to go on with, and used a sequence number again.
 #[test]
 fn no_later_run_goes_on_with_a_past_that_came_back_from_peers() {
-    let (keyframes, _) = drive(&World::new(1), 0, 8);
-    let mut wires =
-        Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 5 }), agent(1, Restored::default())]);
-    for keyframe in &keyframes {
-        wires.input(0, Input::Keyframe(keyframe.clone()));
-    }
-    wires.run(Duration::from_secs(2));
+    let mut wires = two_who_know_an_epoch(5);
     wires.agents[0] = agent(0, Restored { records: vec![], fresh_epoch: 9 });
     wires.disks[0].clear();
     wires.input(0, Input::Neighbour { robot: robot(1), up: true });

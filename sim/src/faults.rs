@@ -358,4 +358,6 @@ pub struct FaultCounts {
     pub left: u64,
     /// Keyframes that came while the process was down.
     pub keyframes_missed: u64,
+    /// What `gossip.link_bytes_per_sec` held back on robots that ran to the end, since they started.
+    pub held_back: u64,
 }

@@ -1,13 +1,14 @@
 //! How the agent talks (DESIGN §4): new entries of ours are published once; [`crate::gossip`] decides what else is said
-//! about facts; blobs are fetched on demand from whoever may have them. Pose beacons are hints: best effort, latest
+//! about facts, and [`super::traffic`] whether there is room for it; blobs are fetched on demand from whoever may have them. Pose beacons are hints: best effort, latest
 //! wins, never facts.
 
 use super::Agent;
 use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
 use super::knowledge::{Pair, pair_of};
+use super::traffic::{Traffic, is_piece};
 use crate::config::GossipConfig;
-use crate::gossip::{Answer, Spread, Step};
-use crate::ids::{EntryId, Hash, RobotId, SubmapId};
+use crate::gossip::{Answer, Class, Spread, Step};
+use crate::ids::{Hash, RobotId, SubmapId};
 use crate::time::Instant;
 use crate::wire::limits::BLOB_PIECE_LEN;
 use crate::wire::messages::{AlignStatus, Message};
@@ -25,6 +26,7 @@ const WISH_EVERY: Duration = Duration::from_secs(2);
 /// What the gossip remembers.
 pub(super) struct Gossip {
     pub(super) spread: Spread,
+    pub(super) traffic: Traffic,
     beacons: BTreeMap<RobotId, SeenBeacon>,
     blobs: BTreeMap<Hash, Vec<u8>>,
     questions: BTreeMap<QueryId, Question>,
@@ -60,6 +62,7 @@ impl Gossip {
     pub(super) fn new(me: RobotId, config: &GossipConfig, now: Instant) -> Self {
         Self {
             spread: Spread::new(me, config.have_secs, config.answer_secs, now),
+            traffic: Traffic::new(config.link_bytes_per_sec, now),
             beacons: BTreeMap::new(),
             blobs: BTreeMap::new(),
             questions: BTreeMap::new(),
@@ -80,12 +83,16 @@ impl Gossip {
 
     /// Whether the next piece of a blob may be asked for.
     pub(super) fn may_fetch(&self, now: Instant) -> bool {
-        now >= self.next_piece
+        now >= self.next_piece()
     }
 
     /// When the next piece of a blob may be asked for.
     pub(super) fn next_piece(&self) -> Instant {
-        self.next_piece
+        self.traffic.due(self.next_piece, Class::Blob)
+    }
+
+    pub(super) fn blob(&self, hash: Hash) -> Option<&[u8]> {
+        self.blobs.get(&hash).map(Vec::as_slice)
     }
 
     pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>) {
@@ -98,11 +105,14 @@ impl Gossip {
 
 impl Agent {
     pub(super) fn gossip_timeout(&self) -> Option<Instant> {
-        Some(self.gossip.spread.timeout().min(self.gossip.next_pose))
+        let Gossip { spread, traffic, next_pose, .. } = &self.gossip;
+        let speak = spread.timeout().max(traffic.due(self.now, Class::Have));
+        [Some(speak), Some(*next_pose), traffic.timeout(self.now)].into_iter().flatten().min()
     }
 
     pub(super) fn run_timers(&mut self) {
         self.expire_questions();
+        self.publish_unsent();
         self.spread();
         if self.now >= self.gossip.next_pose {
             self.gossip.next_pose = self.now.after(Duration::from_secs_f64(self.config.gossip.pose_secs));
@@ -114,17 +124,21 @@ impl Agent {
         }
     }
 
-    /// Does what the gossip about facts wants done now.
+    /// Does what the gossip about facts wants done now, as long as there is room for it.
     fn spread(&mut self) {
         // While received entries wait for the disk our vector is stale: asking now would fetch them twice.
         let busy = !self.ledger.waiting.is_empty() || !self.ledger.open.is_empty();
-        while let Some(step) = self.gossip.spread.step(self.now, &self.replica, busy, &mut self.rng) {
+        while self.gossip.traffic.may(self.now, Class::Have) {
+            let Some(step) = self.gossip.spread.step(self.now, &self.replica, busy, &mut self.rng) else { return };
             match step {
                 Step::Announce(root) => self.publish(Channel::Have, &Message::Have(root)),
                 Step::Ask { peer, have } => {
                     self.ask(peer, QueryKind::Sync, &Message::SyncRequest(have), About::Sync);
                 }
             }
+        }
+        if self.gossip.spread.timeout() <= self.now {
+            self.may_speak();
         }
     }
 
@@ -143,32 +157,13 @@ impl Agent {
         }
     }
 
-    fn is_alone(&self) -> bool {
+    pub(super) fn is_alone(&self) -> bool {
         self.gossip.spread.neighbours().next().is_none()
-    }
-
-    /// Publishes entries of ours that just became durable.
-    pub(super) fn publish_entries(&mut self, ids: &[EntryId]) {
-        if self.is_alone() {
-            return; // Nobody listens; whoever comes will sync.
-        }
-        let entries: Vec<Vec<u8>> =
-            ids.iter().filter_map(|id| self.replica.entry_bytes(*id).map(<[u8]>::to_vec)).collect();
-        for message in Message::facts(entries) {
-            self.publish(Channel::Facts, &message);
-        }
-    }
-
-    fn publish(&mut self, channel: Channel, message: &Message) {
-        let bytes = message.encode();
-        self.stats.sent(message.kind(), bytes.len());
-        self.outputs.push_back(Output::Publish { channel, bytes });
     }
 
     fn ask(&mut self, peer: RobotId, kind: QueryKind, message: &Message, about: About) -> QueryId {
         let query = self.new_query();
-        let bytes = message.encode();
-        self.stats.sent(message.kind(), bytes.len());
+        let bytes = self.pay_for(message);
         let expires = self.now.after(Duration::from_secs_f64(3.0 * self.config.gossip.answer_secs));
         self.gossip.questions.insert(query, Question { peer, about, expires });
         self.outputs.push_back(Output::Ask { query, peer, kind, bytes });
@@ -239,6 +234,9 @@ impl Agent {
 
     fn send_wish(&mut self) {
         let Some(pair) = self.best_wish() else { return };
+        if !self.may_speak() {
+            return;
+        }
         let peer = if pair.0.frame.robot == self.me.robot { pair.1.frame.robot } else { pair.0.frame.robot };
         let request = Message::AlignRequest { i: pair.0, j: pair.1 };
         self.ask(peer, QueryKind::Align, &request, About::Align);
@@ -267,7 +265,10 @@ impl Agent {
                 for proof in &delta.forks {
                     new += usize::from(self.ingest_fork(question.peer, proof));
                 }
-                self.synced(question.peer, Answer::Got { new, more: delta.more });
+                let nothing = delta.entries.is_empty() && delta.forks.is_empty();
+                let postponed = delta.more && nothing;
+                let answer = if postponed { Answer::Postponed } else { Answer::Got { new, more: delta.more } };
+                self.synced(question.peer, answer);
             }
             (About::Sync, _) => self.synced(question.peer, if refused { Answer::Refused } else { Answer::Failed }),
             (About::Blob(hash), Some(Message::BlobReply { hash: named, offset, total, bytes })) if named == hash => {
@@ -286,10 +287,15 @@ impl Agent {
     fn on_piece(&mut self, query: QueryId, peer: RobotId, hash: Hash, (offset, total): (u32, u32), piece: &[u8]) {
         let Some(fetch) = self.negotiation.fetches.get_mut(&hash) else { return };
         let left = (total as usize).saturating_sub(fetch.got.len());
-        if offset as usize != fetch.got.len() || piece.is_empty() || piece.len() != left.min(BLOB_PIECE_LEN) {
+        let goes_on = offset as usize == fetch.got.len() && left > 0;
+        if goes_on && piece.is_empty() {
+            return self.fetch_postponed(query, hash);
+        }
+        if !goes_on || !is_piece(piece.len(), left) {
             return self.negotiation.fetch_failed(query, self.now);
         }
         fetch.got.extend_from_slice(piece);
+        self.gossip.traffic.not_postponed(hash);
         if fetch.got.len() < total as usize {
             fetch.query = None;
             fetch.not_before = self.gossip.next_piece;
@@ -320,11 +326,12 @@ impl Agent {
                 None
             }
         };
-        let bytes = answer.map_or_else(Vec::new, |message| {
-            let bytes = message.encode();
-            self.stats.sent(message.kind(), bytes.len());
-            bytes
-        });
+        let class = match kind {
+            QueryKind::Sync => Class::Repair,
+            QueryKind::Blob => Class::Blob,
+            QueryKind::Align => Class::Have,
+        };
+        let bytes = answer.map_or_else(Vec::new, |message| self.pay_for_answer(class, &message));
         self.outputs.push_back(Output::Answer { token, bytes });
     }
 
@@ -333,19 +340,16 @@ impl Agent {
             (QueryKind::Sync, Message::SyncRequest(have)) => {
                 let have = self.replica.read_have(&have)?;
                 self.gossip.spread.on_asked(self.now, &self.replica, &have);
-                Some(Message::SyncReply(self.replica.delta_for(&have, self.config.gossip.delta_bytes_max)))
+                Some(Message::SyncReply(self.repair(&have)))
             }
             (QueryKind::Blob, Message::BlobRequest { hash, offset, len }) => {
-                let blob = self.gossip.blobs.get(&hash)?;
-                let start = offset as usize;
-                let end = start.saturating_add(len as usize).min(blob.len());
-                let bytes = blob.get(start..end)?.to_vec(); // Beyond its end there is nothing to say.
-                Some(Message::BlobReply { hash, offset, total: blob.len() as u32, bytes })
+                self.piece(hash, offset as usize, len as usize)
             }
-            (QueryKind::Align, Message::AlignRequest { i, j }) => {
+            (QueryKind::Align, Message::AlignRequest { i, j }) if self.may_speak() => {
                 let pair = pair_of(i, j);
                 Some(Message::AlignReply { status: self.wished(pair) })
             }
+            (QueryKind::Align, Message::AlignRequest { .. }) => None,
             (_, other) => {
                 self.reject(None, "wrong question", other.kind());
                 None

@@ -20,6 +20,7 @@ mod negotiation;
 mod shortlist;
 mod solving;
 mod stats;
+mod traffic;
 mod view;
 
 use crate::config::{Config, ConfigError};
@@ -46,6 +47,7 @@ use thiserror::Error;
 pub use condensing::GONE_IN_A_ROW_MAX;
 pub use knowledge::Agreement;
 pub use negotiation::{ALIGNMENTS_PER_FRAME_PAIR, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP};
+pub use traffic::{POSTPONED_MAX, UNSENT_MAX};
 
 /// A clock that shows more (after 292 years, or because it is broken) stands still for the agent: pauses must end after
 /// they begin, or whatever is repeated after a pause would be repeated without one.

@@ -1,6 +1,7 @@
 //! Counters, and refusals reported without letting a noisy peer flood the log: every refusal is counted, but a peer is
 //! named in an event at most once per [`REPORT_EVERY`].
 
+use crate::gossip::Class;
 use crate::ids::RobotId;
 use crate::time::Instant;
 use core::time::Duration;
@@ -24,6 +25,8 @@ pub struct Stats {
     pub rejected_by_peer: BTreeMap<Option<RobotId>, PeerRejections>,
     /// Work done, by kind.
     pub work: BTreeMap<&'static str, u64>,
+    /// What the link's budget held back, by class.
+    pub held_back: BTreeMap<&'static str, u64>,
 }
 
 /// Refusals of one peer's input.
@@ -49,6 +52,11 @@ impl Stats {
     /// Counts a piece of work.
     pub fn worked(&mut self, kind: &'static str) {
         *self.work.entry(kind).or_default() += 1;
+    }
+
+    /// Counts what the link's budget held back.
+    pub fn held_back(&mut self, class: Class, count: usize) {
+        *self.held_back.entry(class.name()).or_default() += count as u64;
     }
 
     /// Counts a refusal. `Some(suppressed)` if it should be reported now, with the number of refusals of this peer

@@ -251,6 +251,7 @@ impl Agent {
             rejected: counts(&stats.rejected),
             rejected_by_peer: stats.rejected_by_peer.iter().map(|(peer, row)| (peer_name(peer), row.total)).collect(),
             work: counts(&stats.work),
+            held_back: counts(&stats.held_back),
         }
     }
 

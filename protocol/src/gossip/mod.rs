@@ -9,8 +9,11 @@
 //! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
 //! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
 //!   pause that doubles until either side changes.
+//! - What goes out is counted against a [`Budget`] by class; a neighbour whose link has no room says so, and is asked
+//!   again later.
 
 mod announce;
+mod budget;
 mod neighbour;
 mod purse;
 #[cfg(test)]
@@ -20,6 +23,8 @@ use crate::ids::{FrameId, RobotId};
 use crate::replica::{Have, Replica};
 use crate::time::Instant;
 use crate::wire::{HaveRoot, HaveVector};
+pub use budget::{Budget, Class, PIECE_BYTES_MIN, REPAIR_BYTES_MIN, burst_bytes};
+
 use announce::Announce;
 use core::time::Duration;
 use neighbour::Neighbour;
@@ -56,6 +61,8 @@ pub enum Answer {
     Failed,
     /// The neighbour could not read the question.
     Refused,
+    /// The neighbour has something for us, and no room on its link now.
+    Postponed,
     /// Entries or proofs came.
     Got {
         /// Those that were new.

@@ -17,6 +17,10 @@ const STRANGERS: f64 = 100.0;
 const REST_MIN: Duration = Duration::from_secs(1);
 /// ...and the longest.
 const REST_MAX: Duration = Duration::from_secs(60);
+/// First pause after a neighbour had no room on its link...
+const LATER_MIN: Duration = Duration::from_millis(500);
+/// ...and the longest.
+const LATER_MAX: Duration = Duration::from_secs(4);
 /// Round trip assumed before the first answer.
 const ROUND_TRIP: Duration = Duration::from_millis(100);
 /// Shortest patience with a question.
@@ -41,6 +45,8 @@ pub(super) struct Neighbour {
     more: bool,
     round_trip: Duration,
     rest: Option<Rest>,
+    /// It had no room on its link: not asked before, and the pause that this was.
+    later: Option<(Instant, Duration)>,
 }
 
 /// A question under way.
@@ -48,6 +54,8 @@ pub(super) struct Neighbour {
 struct Question {
     at: Instant,
     named: bool,
+    /// Where its vector began.
+    window: Option<FrameId>,
 }
 
 /// Nothing is to be gained while both sides stay as they are.
@@ -72,6 +80,7 @@ impl Default for Neighbour {
             more: false,
             round_trip: ROUND_TRIP,
             rest: None,
+            later: None,
         }
     }
 }
@@ -104,6 +113,9 @@ impl Neighbour {
     ) -> Result<f64, Instant> {
         if self.asked.is_some() {
             return Err(Instant::MAX); // Its answer, or its failure, wakes us.
+        }
+        if let Some((until, _)) = self.later.filter(|(until, _)| now < *until) {
+            return Err(until);
         }
         let theirs = self.announced.map(|(have, _)| have.root);
         match self.rest {
@@ -141,7 +153,7 @@ impl Neighbour {
     /// The vector to ask it with: of the logs it is known to have more of, else of all.
     pub fn question(&mut self, now: Instant, me: RobotId, replica: &Replica) -> HaveVector {
         let named = self.named(replica);
-        self.asked = Some(Question { at: now, named: !named.is_empty() });
+        self.asked = Some(Question { at: now, named: !named.is_empty(), window: self.window });
         if !named.is_empty() {
             return replica.have_named(me, self.listed, named);
         }
@@ -163,8 +175,16 @@ impl Neighbour {
                 let futile = core::mem::replace(&mut self.listed, true);
                 return self.rest(now, root, futile);
             }
+            Answer::Postponed => {
+                // All is as it was before the question: what was to be resumed still is.
+                let pause = self.later.map_or(LATER_MIN, |(_, pause)| (2 * pause).min(LATER_MAX));
+                self.later = Some((now.after(pause), pause));
+                self.window = question.window;
+                return;
+            }
             Answer::Got { new, more } => (new, more),
         };
+        self.later = None;
         self.round_trip = (3 * self.round_trip + now.since(question.at)) / 4;
         self.more = more && new > 0;
         if self.more {
@@ -198,5 +218,42 @@ impl Neighbour {
             _ => REST_MIN,
         };
         self.rest = Some(Rest { theirs, ours, until: now.after(pause), pause });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::replica::testing::replica;
+    use crate::wire::samples;
+
+    #[test]
+    fn who_has_no_room_is_asked_the_same_again_after_a_pause() {
+        let (replica, me) = (replica(), samples::robot(0));
+        let ours = (replica.root(), replica.count());
+        let mut one = Neighbour::default();
+        one.heard(Instant::ZERO, HaveRoot { root: [1; 8], count: 50 });
+        one.question(Instant::ZERO, me, &replica);
+        one.answered(Instant::ZERO, ours.0, Answer::Got { new: 5, more: true });
+        one.window = Some(samples::frame(0, 1));
+        let mut now = Instant::ZERO;
+        let mut pause = LATER_MIN;
+        for _ in 0..8 {
+            assert_eq!(one.promises(now, &replica, ours, true, 1), Ok(f64::from(u32::MAX)), "a tail to resume");
+            let before = one.window;
+            one.question(now, me, &replica);
+            one.answered(now, ours.0, Answer::Postponed);
+            assert_eq!(one.window, before);
+            let again = now.after(pause);
+            let soon = now.after(pause - Duration::from_millis(1));
+            assert_eq!(one.promises(soon, &replica, ours, true, 1), Err(again));
+            now = again;
+            pause = (2 * pause).min(LATER_MAX);
+        }
+        one.question(now, me, &replica);
+        one.answered(now, ours.0, Answer::Got { new: 1, more: true });
+        one.question(now, me, &replica);
+        one.answered(now, ours.0, Answer::Postponed);
+        assert_eq!(one.promises(now, &replica, ours, true, 1), Err(now.after(LATER_MIN)), "it had room meanwhile");
     }
 }

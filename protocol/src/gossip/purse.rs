@@ -9,50 +9,71 @@ const FACTS_PER_COIN: f64 = 8.0;
 /// Shortest wait: news seldom come alone.
 const WAIT_MIN: Duration = Duration::from_millis(50);
 
-/// A token bucket.
+/// A token bucket: it fills steadily up to a limit, and may be in debt.
 #[derive(Clone, Debug)]
-pub(super) struct Purse {
-    coins: f64,
+pub(super) struct Bucket {
+    level: f64,
     at: Instant,
-    coins_per_sec: f64,
-    coins_max: f64,
+    per_sec: f64,
+    full: f64,
 }
+
+impl Bucket {
+    /// A full one.
+    pub fn new(per_sec: f64, full: f64, now: Instant) -> Self {
+        Self { level: full, at: now, per_sec, full }
+    }
+
+    /// What it holds when it is full.
+    pub fn full(&self) -> f64 {
+        self.full
+    }
+
+    pub fn level(&self, now: Instant) -> f64 {
+        let earned = self.per_sec * now.since(self.at).as_secs_f64();
+        (self.level + earned).min(self.level.max(self.full))
+    }
+
+    /// When it holds so much, from `now` on.
+    pub fn due(&self, now: Instant, level: f64) -> Instant {
+        let now = now.max(self.at);
+        let lacking = level - self.level(now);
+        if lacking <= 0.0 { now } else { now.after(Duration::from_secs_f64(lacking / self.per_sec)) }
+    }
+
+    pub fn set(&mut self, now: Instant, level: f64) {
+        (self.level, self.at) = (level, now);
+    }
+}
+
+/// A bucket of coins.
+#[derive(Clone, Debug)]
+pub(super) struct Purse(Bucket);
 
 impl Purse {
     pub fn new(coins_per_sec: f64, coins_max: f64, now: Instant) -> Self {
-        Self { coins: coins_max, at: now, coins_per_sec, coins_max }
+        Self(Bucket::new(coins_per_sec, coins_max, now))
     }
 
     /// When a message about `facts` facts may go out.
     pub fn due(&self, now: Instant, facts: f64) -> Instant {
-        self.due_to(now, facts, 1.0)
-    }
-
-    fn due_to(&self, now: Instant, facts: f64, copies: f64) -> Instant {
-        let lacking = copies * price(facts) - self.coins_at(now);
-        if lacking <= 0.0 { now } else { now.after(Duration::from_secs_f64(lacking / self.coins_per_sec)) }
+        self.0.due(now, price(facts))
     }
 
     /// When a message may go out that costs this many times the usual; a little later at least.
     pub fn due_soon(&self, now: Instant, facts: f64, copies: f64) -> Instant {
-        self.due_to(now, facts, copies).max(now.after(WAIT_MIN))
+        self.0.due(now, copies * price(facts)).max(now.after(WAIT_MIN))
     }
 
     /// A message about `facts` facts goes out; one that could not wait makes debts.
     pub fn pay(&mut self, now: Instant, facts: f64, copies: f64) {
-        self.coins = (self.coins_at(now) - copies * price(facts)).max(-self.coins_max - copies);
-        self.at = now;
+        let left = (self.0.level(now) - copies * price(facts)).max(-self.0.full() - copies);
+        self.0.set(now, left);
     }
 
     /// Much was moved at once: now the purse holds twice what fills it otherwise.
     pub fn refill(&mut self, now: Instant) {
-        self.coins = 2.0 * self.coins_max;
-        self.at = now;
-    }
-
-    fn coins_at(&self, now: Instant) -> f64 {
-        let earned = self.coins_per_sec * now.since(self.at).as_secs_f64();
-        (self.coins + earned).min(self.coins.max(self.coins_max))
+        self.0.set(now, 2.0 * self.0.full());
     }
 }
 
@@ -82,8 +103,8 @@ mod tests {
         assert_eq!(at_once(&mut purse), 4);
         purse.refill(now);
         let later = now.after(Duration::from_secs(100));
-        assert!(purse.coins_at(later) <= 4.0, "what it holds beyond its fill does not grow");
+        assert!(purse.0.level(later) <= 4.0, "what it holds beyond its fill does not grow");
         purse.pay(later, 1.0, 4.0);
-        assert!(purse.coins_at(later.after(Duration::from_secs(100))) <= 2.0);
+        assert!(purse.0.level(later.after(Duration::from_secs(100))) <= 2.0);
     }
 }

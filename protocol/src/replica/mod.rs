@@ -9,6 +9,7 @@
 //! - Equal sets of durable entries have equal [`Replica::have`], [`Replica::root`] and [`Replica::digest`], whatever
 //!   the order, duplication or batching in which they came.
 
+mod append;
 mod delta;
 #[cfg(test)]
 mod floor_tests;
@@ -22,7 +23,8 @@ pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
 
+pub use append::AppendError;
 pub use fork::ForkProof;
 pub use have::{Have, VectorForm};
 pub use restore::{Damage, RestoreError};
-pub use set::{AppendError, EARLY_PER_ROBOT_MAX, IngestError, Ingested, MEMBERS_MAX, Replica, RosterError};
+pub use set::{EARLY_PER_ROBOT_MAX, IngestError, Ingested, MEMBERS_MAX, Replica, RosterError};

@@ -1,7 +1,9 @@
-//! A closed epoch stays closed (DESIGN §8.4): once a robot has written an entry of an epoch, it never writes one of an
+//! A closed epoch stays closed (DESIGN §8.4). Once a robot has written an entry of an epoch, it never writes one of an
 //! earlier epoch of its own again, in no later run. What it merely gets back from others is no writing: somebody's disk
-//! held it before.
+//! held it before. But what came back closes its epoch as well: others may hold more of it than came, so a robot that
+//! writes on there may tell a second story, and neither this run nor one that finds on disk what came back may do so.
 
+use super::pending::Pending;
 use super::{Check, Seen};
 use merganser_protocol::agent::io::{Output, Record};
 use merganser_protocol::ids::{EntryId, Hash, RobotId};
@@ -15,6 +17,44 @@ pub struct Closed {
     /// Every entry that was handed to a disk.
     known: BTreeSet<(EntryId, Hash)>,
     doubted: BTreeSet<RobotId>,
+    forgers: BTreeSet<RobotId>,
+    returned: BTreeMap<usize, Returned>,
+}
+
+/// What came back to one robot.
+#[derive(Debug, Default)]
+struct Returned {
+    robot: Option<RobotId>,
+    /// The latest epoch that it knows in this run...
+    epoch: Option<u32>,
+    /// ...and in every run.
+    on_disk: Option<u32>,
+    waiting: Pending<u32>,
+}
+
+impl Closed {
+    fn persist(&mut self, robot: usize, batch: u64, id: EntryId, bytes: &[u8]) -> Result<(), String> {
+        let (origin, epoch) = (id.frame.robot, id.frame.epoch);
+        let is_new = self.known.insert((id, Hash::of(bytes)));
+        let returned = self.returned.entry(robot).or_default();
+        let is_own = returned.robot == Some(origin);
+        if !is_new {
+            if is_own {
+                returned.epoch = returned.epoch.max(Some(epoch));
+                returned.waiting.hand_over(batch, [epoch]);
+            }
+            return Ok(());
+        }
+        if is_own && returned.epoch >= Some(epoch) && !self.forgers.contains(&origin) {
+            return Err(format!("robot {robot}: new entry {id} of an epoch that came back from others"));
+        }
+        let latest = self.latest.entry(origin).or_insert(epoch);
+        if epoch < *latest && !self.doubted.contains(&origin) {
+            return Err(format!("robot {robot}: new entry {id}, after epoch {latest} was begun"));
+        }
+        *latest = epoch.max(*latest);
+        Ok(())
+    }
 }
 
 impl Check for Closed {
@@ -24,23 +64,32 @@ impl Check for Closed {
 
     fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
         match seen {
+            Seen::Started(id) => self.returned.entry(robot).or_default().robot = Some(*id),
             // A disk that lost what its writer knew cannot know which epochs were closed.
             Seen::MayFork(origin) => {
                 self.doubted.insert(*origin);
             }
-            Seen::Output(Output::Persist { records, .. }) => {
+            Seen::Forges(origin) => {
+                self.forgers.insert(*origin);
+            }
+            Seen::Output(Output::Persist { batch, records }) => {
                 for record in records {
                     let Record::Entry { id, bytes } = record else { continue };
-                    if !self.known.insert((*id, Hash::of(bytes))) {
-                        continue;
-                    }
-                    let origin = id.frame.robot;
-                    let latest = self.latest.entry(origin).or_insert(id.frame.epoch);
-                    if id.frame.epoch < *latest && !self.doubted.contains(&origin) {
-                        return Err(format!("robot {robot}: new entry {id}, after epoch {latest} was begun"));
-                    }
-                    *latest = id.frame.epoch.max(*latest);
+                    self.persist(robot, *batch, *id, bytes)?;
                 }
+            }
+            Seen::Durable(batch) => {
+                let returned = self.returned.entry(robot).or_default();
+                returned.on_disk = returned.waiting.durable(*batch).into_iter().max().max(returned.on_disk);
+            }
+            Seen::Died => {
+                let returned = self.returned.entry(robot).or_default();
+                returned.waiting.lose();
+                returned.epoch = returned.on_disk;
+            }
+            Seen::Wiped | Seen::Damaged => {
+                let returned = self.returned.entry(robot).or_default();
+                *returned = Returned { robot: returned.robot, ..Returned::default() };
             }
             _ => {}
         }
@@ -53,8 +102,10 @@ mod tests {
     use super::*;
     use merganser_protocol::ids::FrameId;
 
+    const ME: RobotId = RobotId([1; 8]);
+
     fn persist(check: &mut Closed, epoch: u32, seq: u32) -> Result<(), String> {
-        let id = EntryId { frame: FrameId { robot: RobotId([1; 8]), epoch }, seq };
+        let id = EntryId { frame: FrameId { robot: ME, epoch }, seq };
         let records = vec![Record::Entry { id, bytes: vec![epoch as u8, seq as u8] }];
         check.see(0, &Seen::Output(&Output::Persist { batch: 1, records }))
     }
@@ -71,7 +122,46 @@ mod tests {
     fn whose_disk_forgot_is_excused() {
         let mut check = Closed::default();
         assert!(persist(&mut check, 5, 0).is_ok());
-        assert!(check.see(0, &Seen::MayFork(RobotId([1; 8]))).is_ok());
+        assert!(check.see(0, &Seen::MayFork(ME)).is_ok());
         assert!(persist(&mut check, 3, 0).is_ok());
+    }
+
+    #[test]
+    fn it_bites_on_a_new_entry_of_an_epoch_that_came_back_even_from_a_disk_that_forgot() {
+        for (excused, forges) in [(Seen::MayFork(ME), false), (Seen::Forges(ME), true)] {
+            let mut check = Closed::default();
+            check.see(0, &Seen::Started(ME)).unwrap();
+            assert!(persist(&mut check, 5, 0).is_ok() && persist(&mut check, 5, 1).is_ok());
+            check.see(0, &excused).unwrap();
+            check.see(0, &Seen::Wiped).unwrap();
+            assert!(persist(&mut check, 5, 0).is_ok(), "it comes back");
+            assert_eq!(persist(&mut check, 5, 2).is_ok(), forges);
+            assert!(persist(&mut check, 6, 0).is_ok());
+        }
+    }
+
+    #[test]
+    fn what_came_back_binds_later_runs_once_it_is_on_disk() {
+        for durable in [false, true] {
+            let mut check = Closed::default();
+            check.see(0, &Seen::Started(ME)).unwrap();
+            assert!(persist(&mut check, 5, 0).is_ok());
+            check.see(0, &Seen::Wiped).unwrap();
+            assert!(persist(&mut check, 5, 0).is_ok(), "it comes back");
+            if durable {
+                check.see(0, &Seen::Durable(1)).unwrap();
+            }
+            check.see(0, &Seen::Died).unwrap();
+            check.see(0, &Seen::Started(ME)).unwrap();
+            assert_eq!(persist(&mut check, 5, 1).is_err(), durable);
+        }
+    }
+
+    #[test]
+    fn what_comes_back_to_others_closes_nothing() {
+        let mut check = Closed::default();
+        check.see(0, &Seen::Started(RobotId([2; 8]))).unwrap();
+        assert!(persist(&mut check, 5, 0).is_ok() && persist(&mut check, 5, 0).is_ok());
+        assert!(persist(&mut check, 5, 1).is_ok());
     }
 }

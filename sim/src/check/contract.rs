@@ -25,7 +25,7 @@ impl Check for Contract {
     fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
         let run = self.robots.entry(robot).or_default();
         match seen {
-            Seen::Started => *run = Run::default(),
+            Seen::Started(_) => *run = Run::default(),
             Seen::Asked(token) => {
                 run.asked.insert(*token);
             }
@@ -50,6 +50,7 @@ impl Check for Contract {
 mod tests {
     use super::*;
     use merganser_protocol::agent::io::AskToken;
+    use merganser_protocol::ids::RobotId;
 
     fn persist(batch: u64) -> Output {
         Output::Persist { batch, records: Vec::new() }
@@ -59,7 +60,7 @@ mod tests {
     fn it_bites_on_a_hole_and_starts_over_with_the_process() {
         let mut check = Contract::default();
         assert!(check.see(0, &Seen::Output(&persist(1))).is_ok());
-        assert!(check.see(0, &Seen::Started).is_ok());
+        assert!(check.see(0, &Seen::Started(RobotId([1; 8]))).is_ok());
         assert!(check.see(0, &Seen::Output(&persist(1))).is_ok());
         assert!(check.see(0, &Seen::Output(&persist(3))).is_err());
     }

@@ -1,12 +1,23 @@
 //! When faults stop, all converge in the stated time (DESIGN §8.6): at the end of a run every robot that is running
-//! holds the same digest.
+//! holds the same digest. A swarm that is still at work then writes on, and its last facts may be on their way: what any
+//! robot held [`LAG`] samples before, all must hold, and equal logs must have equal digests.
 
-use super::{Check, Phase, Sample};
-use std::collections::BTreeSet;
+use super::{Check, Phase, RobotSample, Sample};
+use merganser_protocol::ids::FrameId;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+/// Samples (at least a second apart) that a fact may take to reach everyone.
+const LAG: usize = 10;
+
+/// Lengths of logs; `None` for those with two histories.
+type Logs = BTreeMap<FrameId, Option<u32>>;
 
 /// See the module. The stated time is the scenario's `settle_secs`.
-#[derive(Debug)]
-pub struct Converged;
+#[derive(Debug, Default)]
+pub struct Converged {
+    /// What anybody held since the healing, the latest last.
+    held: VecDeque<Logs>,
+}
 
 impl Check for Converged {
     fn name(&self) -> &'static str {
@@ -14,18 +25,46 @@ impl Check for Converged {
     }
 
     fn sample(&mut self, sample: &Sample<'_>) -> Result<(), String> {
-        let digests: BTreeSet<_> = sample.robots.iter().map(|robot| robot.digest).collect();
+        let robots = &sample.robots;
+        if sample.phase == Phase::Calm {
+            self.held.push_back(all_logs(robots));
+            self.held.drain(..self.held.len().saturating_sub(LAG));
+        }
+        let digests: BTreeSet<_> = robots.iter().map(|robot| robot.digest).collect();
         if sample.phase != Phase::End || digests.len() <= 1 {
             return Ok(());
         }
-        let of = |robot: &super::RobotSample| {
+        let logs: BTreeSet<&Logs> = robots.iter().map(|robot| &robot.logs).collect();
+        let old = self.held.front().filter(|_| self.held.len() == LAG);
+        if logs.len() == digests.len() && old.is_some_and(|old| robots.iter().all(|robot| holds(&robot.logs, old))) {
+            return Ok(());
+        }
+        let of = |robot: &RobotSample| {
             let status = robot.snapshot.as_ref().map(|s| (s.status.entries, s.status.pending));
             let (entries, pending) = status.unwrap_or_default();
             format!("{} {:?} ({entries} entries, {pending} pending)", robot.name, robot.digest)
         };
-        let all: Vec<String> = sample.robots.iter().map(of).collect();
+        let all: Vec<String> = robots.iter().map(of).collect();
         Err(format!("{} different sets: {}", digests.len(), all.join(", ")))
     }
+}
+
+fn all_logs(robots: &[RobotSample]) -> Logs {
+    let mut all = Logs::new();
+    for (frame, len) in robots.iter().flat_map(|robot| &robot.logs) {
+        let one = all.entry(*frame).or_insert(Some(0));
+        *one = one.zip(*len).map(|(a, b)| a.max(b));
+    }
+    all
+}
+
+fn holds(logs: &Logs, old: &Logs) -> bool {
+    old.iter().all(|(frame, old)| match (logs.get(frame), old) {
+        (Some(None), _) => true,
+        (Some(Some(len)), Some(old)) => len >= old,
+        (None, Some(old)) => *old == 0,
+        (_, None) => false,
+    })
 }
 
 #[cfg(test)]
@@ -33,15 +72,43 @@ mod tests {
     use super::super::tests::{robot, sample};
     use super::*;
     use crate::scenario::Expect;
-    use std::collections::BTreeMap;
+    use merganser_protocol::ids::RobotId;
+
+    const FRAME: FrameId = FrameId { robot: RobotId([1; 8]), epoch: 4 };
 
     #[test]
     fn it_bites_only_at_the_end() {
         let (truth, expect) = (BTreeMap::new(), Expect::default());
         let end = sample(vec![robot("alpha", 1, &[]), robot("beta", 2, &[])], &truth, &expect);
-        assert!(Converged.sample(&end).is_err());
-        assert!(Converged.sample(&Sample { phase: Phase::Calm, ..end }).is_ok());
+        assert!(Converged::default().sample(&end).is_err());
+        assert!(Converged::default().sample(&Sample { phase: Phase::Calm, ..end }).is_ok());
         let end = sample(vec![robot("alpha", 1, &[]), robot("beta", 1, &[])], &truth, &expect);
-        assert!(Converged.sample(&end).is_ok());
+        assert!(Converged::default().sample(&end).is_ok());
+    }
+
+    /// Whether it bites when alpha held so much of a log for so many samples, more at the end, and beta this.
+    fn bites(before: Option<u32>, samples: usize, beta: Option<u32>) -> bool {
+        let (truth, expect) = (BTreeMap::new(), Expect::default());
+        let two = |alpha: Option<u32>, beta: Option<u32>| {
+            let mut robots = vec![robot("alpha", 1, &[]), robot("beta", 2, &[])];
+            robots[0].logs.insert(FRAME, alpha);
+            robots[1].logs.insert(FRAME, beta);
+            robots
+        };
+        let mut check = Converged::default();
+        for _ in 0..samples {
+            let calm = sample(two(before, Some(0)), &truth, &expect);
+            check.sample(&Sample { phase: Phase::Calm, ..calm }).unwrap();
+        }
+        check.sample(&sample(two(Some(9), beta), &truth, &expect)).is_err()
+    }
+
+    #[test]
+    fn the_last_facts_of_a_swarm_at_work_may_be_on_their_way_and_no_others() {
+        assert!(!bites(Some(7), LAG, Some(7)));
+        assert!(bites(Some(7), LAG, Some(6)), "it was there long enough");
+        assert!(bites(Some(7), LAG - 1, Some(7)), "nobody knows how long it was there");
+        assert!(bites(Some(7), LAG, Some(9)), "equal logs, different digests");
+        assert!(bites(None, LAG, Some(9)) && bites(None, LAG, Some(8)), "a quarantine reaches all");
     }
 }

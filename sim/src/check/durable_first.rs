@@ -39,7 +39,7 @@ impl Check for DurableFirst {
     fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
         let state = self.robots.entry(robot).or_default();
         match seen {
-            Seen::Started | Seen::Died => {
+            Seen::Started(_) | Seen::Died => {
                 state.waiting.clear();
                 state.sent.clear();
             }
@@ -164,7 +164,7 @@ mod tests {
         assert!(check.see(0, &Seen::Output(&publish())).is_ok());
         assert!(check.see(0, &Seen::Output(&persist())).is_ok(), "stored once more");
         assert!(check.see(0, &Seen::Output(&publish())).is_ok());
-        for seen in [Seen::Died, Seen::Wiped, Seen::Started] {
+        for seen in [Seen::Died, Seen::Wiped, Seen::Started(RobotId([1; 8]))] {
             assert!(check.see(0, &seen).is_ok());
         }
         assert!(check.see(0, &Seen::Output(&persist())).is_ok());

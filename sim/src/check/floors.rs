@@ -2,6 +2,7 @@
 //! that place is put on it again, in no later run, and the robot offers none to others. A disk that was wiped, or that
 //! lost what it had confirmed, is excused.
 
+use super::pending::Pending;
 use super::{Check, Seen};
 use merganser_protocol::agent::io::{Output, Record};
 use merganser_protocol::ids::FrameId;
@@ -17,8 +18,7 @@ pub struct Floors {
 #[derive(Debug, Default)]
 struct Disk {
     floors: BTreeMap<FrameId, u32>,
-    /// Floors handed to the disk, by batch.
-    waiting: Vec<(u64, FrameId, u32)>,
+    waiting: Pending<(FrameId, u32)>,
 }
 
 impl Disk {
@@ -31,7 +31,7 @@ impl Disk {
         for record in records {
             match record {
                 Record::Entry { id, .. } => self.above(id.frame, id.seq)?,
-                Record::Replaced { below, .. } => self.waiting.push((batch, below.frame, below.seq)),
+                Record::Replaced { below, .. } => self.waiting.hand_over(batch, [(below.frame, below.seq)]),
                 _ => {}
             }
         }
@@ -64,15 +64,14 @@ impl Check for Floors {
             Seen::Output(Output::Persist { batch, records }) => disk.persist(*batch, records),
             Seen::Output(Output::Publish { bytes, .. } | Output::Answer { bytes, .. }) => disk.offers(bytes),
             Seen::Durable(batch) => {
-                let durable: Vec<_> = disk.waiting.extract_if(.., |(number, ..)| *number <= *batch).collect();
-                for (_, frame, seq) in durable {
+                for (frame, seq) in disk.waiting.durable(*batch) {
                     let floor = disk.floors.entry(frame).or_default();
                     *floor = seq.max(*floor);
                 }
                 Ok(())
             }
             Seen::Died => {
-                disk.waiting.clear();
+                disk.waiting.lose();
                 Ok(())
             }
             Seen::Wiped | Seen::Damaged => {

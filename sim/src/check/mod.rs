@@ -11,6 +11,7 @@ mod honest_covariance;
 mod merged_as_expected;
 mod never_back;
 mod no_false_merge;
+mod pending;
 mod same_estimate;
 mod same_facts;
 mod sound_numbers;
@@ -50,8 +51,8 @@ pub trait Check {
 /// What a check can watch on one robot.
 #[derive(Clone, Copy, Debug)]
 pub enum Seen<'a> {
-    /// The process started.
-    Started,
+    /// The process of this robot started.
+    Started(RobotId),
     /// A peer's question was put to it under this token.
     Asked(u64),
     /// It made an output.
@@ -66,6 +67,9 @@ pub enum Seen<'a> {
     Damaged,
     /// From now on there may be two histories of this robot's logs, by no fault of the core.
     MayFork(RobotId),
+    /// From now on entries may come with this robot's signature that its core did not write: by a forger who has its
+    /// key, or by a twin, who may even write the very same.
+    Forges(RobotId),
 }
 
 /// Where in the run a sample was taken.
@@ -141,7 +145,7 @@ impl Checks {
             Box::new(sound_numbers::SoundNumbers),
             Box::new(no_false_merge::NoFalseMerge),
             Box::new(honest_covariance::HonestCovariance),
-            Box::new(converged::Converged),
+            Box::<converged::Converged>::default(),
             Box::new(merged_as_expected::MergedAsExpected),
         ])
     }

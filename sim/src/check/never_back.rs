@@ -1,7 +1,9 @@
 //! What a robot holds never shrinks (DESIGN §8.3, §8.4, and no acknowledged fact is lost): a log that was durable on a
 //! robot's disk up to some place is so at every later moment and after every restart, a log in quarantine stays there,
-//! and the robot's own epoch does not fall, nor does it return to one that its disk knows as closed. A disk that was wiped, or that lost what it had confirmed, is excused.
+//! and the robot's own epoch does not fall, nor does it return to one that its disk knows as closed. A disk that was
+//! wiped, or that lost what it had confirmed, is excused.
 
+use super::pending::Pending;
 use super::{Check, RobotSample, Sample, Seen};
 use merganser_protocol::agent::io::{Output, Record};
 use merganser_protocol::ids::{EntryId, FrameId};
@@ -19,10 +21,8 @@ struct Held {
     epoch: u32,
     /// The first epoch that the disk does not know as closed.
     open: u32,
-    /// Entries handed to the disk, by batch.
-    waiting: Vec<(u64, EntryId)>,
-    /// Epochs closed, handed to the disk likewise.
-    closing: Vec<(u64, u32)>,
+    entries: Pending<EntryId>,
+    closing: Pending<u32>,
     /// The last batch handed to the disk, and the last that is on it.
     batches: [u64; 2],
     /// Logs seen in quarantine, by the batch that was then the last: once it is on disk, so must be the proof.
@@ -53,7 +53,7 @@ impl Held {
     fn forget(&mut self) {
         self.logs.clear();
         self.quarantined.clear();
-        self.closing.clear();
+        self.closing.lose();
         (self.epoch, self.open) = (0, 0);
     }
 
@@ -101,28 +101,28 @@ impl Check for NeverBack {
         match seen {
             Seen::Output(Output::Persist { batch, records }) => {
                 held.batches[0] = *batch;
-                held.waiting.extend(records.iter().filter_map(|record| match record {
-                    Record::Entry { id, .. } => Some((*batch, *id)),
-                    _ => None,
-                }));
-                held.closing.extend(records.iter().filter_map(|record| match record {
-                    Record::EpochClosed { epoch } => Some((*batch, *epoch)),
-                    _ => None,
-                }));
+                for record in records {
+                    match record {
+                        Record::Entry { id, .. } => held.entries.hand_over(*batch, [*id]),
+                        Record::EpochClosed { epoch } => held.closing.hand_over(*batch, [*epoch]),
+                        _ => {}
+                    }
+                }
             }
             Seen::Durable(batch) => {
-                let (durable, later): (Vec<_>, Vec<_>) = held.waiting.iter().partition(|(number, _)| number <= batch);
-                held.waiting = later;
                 held.batches[1] = *batch;
-                durable.into_iter().for_each(|(_, id)| held.logs.entry(id.frame).or_default().add(id.seq));
-                let closed = held.closing.iter().filter(|(number, _)| number <= batch);
-                held.open = closed.map(|(_, epoch)| epoch.saturating_add(1)).fold(held.open, u32::max);
-                held.closing.retain(|(number, _)| number > batch);
+                for id in held.entries.durable(*batch) {
+                    held.logs.entry(id.frame).or_default().add(id.seq);
+                }
+                for epoch in held.closing.durable(*batch) {
+                    held.open = held.open.max(epoch.saturating_add(1));
+                }
             }
             // An epoch that was begun may die with its process, unless the disk knows that the one before was closed.
             Seen::Died => {
-                (held.waiting, held.epoch, held.batches) = (Vec::new(), held.open, [0, 0]);
-                held.closing.clear();
+                (held.epoch, held.batches) = (held.open, [0, 0]);
+                held.entries.lose();
+                held.closing.lose();
                 held.quarantined.clear();
             }
             Seen::Wiped | Seen::Damaged => held.forget(),

@@ -2,6 +2,7 @@
 //! never two contents under one blob address. An entry that died with its writer before it was durable does not count:
 //! if it got out all the same, another robot's disk shows it.
 
+use super::pending::Pending;
 use super::{Check, Seen};
 use merganser_protocol::agent::io::{Output, Record};
 use merganser_protocol::ids::{EntryId, Hash, RobotId};
@@ -11,8 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 #[derive(Debug, Default)]
 pub struct UniqueEntries {
     entries: BTreeMap<EntryId, Hash>,
-    /// Handed to each robot's disk, by batch.
-    waiting: BTreeMap<usize, Vec<(u64, EntryId, Hash)>>,
+    waiting: BTreeMap<usize, Pending<(EntryId, Hash)>>,
     /// Robots whose keys or disks tell two stories through no fault of the core's. What becomes of these is the
     /// business of convergence: a log with two histories is quarantined on all robots alike.
     doubted: BTreeSet<RobotId>,
@@ -29,7 +29,7 @@ impl Check for UniqueEntries {
             Seen::Output(Output::Persist { batch, records }) => {
                 for record in records {
                     match record {
-                        Record::Entry { id, bytes } => waiting.push((*batch, *id, Hash::of(bytes))),
+                        Record::Entry { id, bytes } => waiting.hand_over(*batch, [(*id, Hash::of(bytes))]),
                         Record::Blob { hash, bytes } if Hash::of(bytes) != *hash => {
                             return Err(format!("robot {robot}: blob {hash} holds something else"));
                         }
@@ -38,17 +38,14 @@ impl Check for UniqueEntries {
                 }
             }
             Seen::Durable(batch) => {
-                let (durable, later) = waiting.iter().partition(|(number, ..)| number <= batch);
-                *waiting = later;
-                let durable: Vec<(u64, EntryId, Hash)> = durable;
-                for (_, id, hash) in durable {
+                for (id, hash) in waiting.durable(*batch) {
                     let doubted = self.doubted.contains(&id.frame.robot);
                     if *self.entries.entry(id).or_insert(hash) != hash && !doubted {
                         return Err(format!("robot {robot}: a second content for entry {id}"));
                     }
                 }
             }
-            Seen::Died => waiting.clear(),
+            Seen::Died => waiting.lose(),
             Seen::MayFork(origin) => {
                 self.doubted.insert(*origin);
             }

@@ -54,7 +54,8 @@ impl<C: Core> Swarm<C> {
         if report.damaged_count > 0 {
             self.see(index, &Seen::Damaged);
         }
-        self.see(index, &Seen::Started);
+        let id = self.robots[index].id;
+        self.see(index, &Seen::Started(id));
         self.counts.restarted += u64::from(incarnation > 1);
         self.drain(now, index);
         self.tell_of_new_frame(now, index);
@@ -157,6 +158,8 @@ impl<C: Core> Swarm<C> {
             Fault::Equivocate { .. } => {
                 self.robots[robot].equivocates = true;
                 self.doubt(robot);
+                let id = self.robots[robot].id;
+                self.see(robot, &Seen::Forges(id));
             }
             Fault::OtherVersion { .. } => self.robots[robot].other_version = true,
             Fault::Flood { .. } => self.queue.push(now, Event::Flood(index)),
@@ -255,6 +258,8 @@ impl<C: Core> Swarm<C> {
         self.robots[twin].gone = false;
         self.counts.twins += 1;
         self.doubt(of);
+        let id = self.robots[of].id;
+        self.see(of, &Seen::Forges(id));
         self.queue.push(now, Event::Boot { robot: twin });
     }
 

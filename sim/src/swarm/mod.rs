@@ -237,6 +237,8 @@ impl<C: Core> Swarm<C> {
     fn finish(mut self, ended: Instant) -> Outcome<C> {
         let robots = self.robot_samples(ended);
         self.pin_frames(&robots);
+        let snapshots = robots.iter().filter_map(|robot| robot.snapshot.as_ref());
+        self.counts.held_back = snapshots.flat_map(|snapshot| snapshot.stats.held_back.values()).sum();
         if self.violation.is_none() {
             let sample =
                 Sample { phase: Phase::End, robots: robots.clone(), truth: &self.truth, expect: &self.scenario.expect };

@@ -12,6 +12,9 @@ use merganser_protocol::config::Config;
 pub const SETTLE_SECS: f64 = 60.0;
 /// Share of the runs in which robots also align, merge and solve.
 const SOLVE_SHARE: f64 = 0.15;
+/// Share of the runs in which robots may send little, and how little, B/s.
+const SLOW_LINK_SHARE: f64 = 0.25;
+const SLOW_LINK: [f64; 2] = [4_000.0, 40_000.0];
 /// Faults begin after this, s: robots boot first.
 const CALM_SECS: f64 = 2.0;
 
@@ -103,6 +106,10 @@ fn config(dice: &mut Dice) -> Config {
     // Logs are short in a run; in half of them floors rise all the same.
     config.gossip.condense_entries = [0, 8 + dice.bits() as u32 % 40][dice.bits() as usize % 2];
     config.gossip.delta_bytes_max = 4096 + dice.bits() as usize % (60 * 1024);
+    let (slow, bytes_per_sec) = (dice.chance(SLOW_LINK_SHARE), dice.range(SLOW_LINK[0], SLOW_LINK[1]));
+    if slow {
+        config.gossip.link_bytes_per_sec = bytes_per_sec;
+    }
     config
 }
 
