@@ -8,9 +8,8 @@
 //! more than what lies sparsely, as things do in the near and the far of a LiDAR scan.
 
 use super::grid::{Grid, LANES, Lanes, bounds, cell_key};
-use crate::simd::wide;
 use core::f32::consts::TAU;
-use pulp::Arch;
+use pulp::{Arch, Simd, WithSimd};
 
 /// Radii at which each ring's weight peaks; it falls linearly to zero at the neighbouring radii. The last is the end.
 const RADII: [f32; RINGS + 1] = [2.0, 5.0, 8.0, 11.0, 14.0, 18.0, 23.0];
@@ -97,13 +96,30 @@ pub fn describe_points(points: &[[f32; 3]], normals: &[[f32; 3]], chosen: &[u32]
         for &k in cell {
             let k = k as usize;
             let (p, n) = (&at[k], &normals[chosen[k] as usize]);
-            let near = wide(arch, || sums(inner, p, n, &inner_hats));
-            let far = wide(arch, || sums(outer, p, n, &outer_hats));
+            let near = arch.dispatch(Around { lanes: inner, p, n, hats: &inner_hats });
+            let far = arch.dispatch(Around { lanes: outer, p, n, hats: &outer_hats });
             let rings = numbers[k].chunks_exact_mut(SUMS).zip(near.iter().chain(&far)).enumerate();
             rings.for_each(|(ring, (numbers, sums))| finish(ring, sums, numbers));
         }
     }
     numbers
+}
+
+/// What [`sums`] needs, as something to be run with the widest instructions: it is too large to be inlined from a closure.
+struct Around<'a, const R: usize> {
+    lanes: &'a Lanes<6>,
+    p: &'a [f32; 3],
+    n: &'a [f32; 3],
+    hats: &'a [Hat; R],
+}
+
+impl<const R: usize> WithSimd for Around<'_, R> {
+    type Output = [[f32; SUMS]; R];
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> Self::Output {
+        sums(self.lanes, self.p, self.n, self.hats)
+    }
 }
 
 /// The [`SUMS`] of each ring about the point `p` with normal `n`.
