@@ -68,7 +68,7 @@ pub struct AlignConfig {
     pub sigma_max_voxels: f64,
     /// An alignment needs log₁₀ NFA below this.
     pub log10_nfa_max: f64,
-    /// ...and at least this support (sum of inlier probabilities).
+    /// ...where a scale is unknown, at least this support (sum of inlier probabilities; elsewhere clouds judge)...
     pub support_min: f64,
     /// ...and at least this share of keypoints with a counterpart in the other cloud.
     pub fit_min: f64,

@@ -135,7 +135,7 @@ impl Agent {
             return;
         }
         for candidate in self.active_candidates() {
-            if !self.has_room() || self.negotiation.fetches.len() >= 2 * FETCHES_MAX {
+            if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
                 break;
             }
             let Candidate { mine, theirs, .. } = candidate;

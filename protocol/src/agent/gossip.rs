@@ -345,7 +345,8 @@ impl Agent {
             (QueryKind::Blob, Message::BlobRequest { hash, offset, len }) => {
                 self.piece(hash, offset as usize, len as usize)
             }
-            (QueryKind::Align, Message::AlignRequest { i, j }) if self.may_speak() => {
+            // What others wish takes what is left, so that nobody's wishes keep us from repairing.
+            (QueryKind::Align, Message::AlignRequest { i, j }) if self.gossip.traffic.may(self.now, Class::Blob) => {
                 let pair = pair_of(i, j);
                 Some(Message::AlignReply { status: self.wished(pair) })
             }

@@ -7,7 +7,7 @@ use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEsti
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
-use crate::submap::{self, Described, Features, Keypoints, RegisterConfig, RegisterError, Submap};
+use crate::submap::{self, Described, Features, Keypoints, RefineError, RegisterConfig, RegisterError, Submap};
 use crate::wire::fact::{RefusalReason, ScaleKind};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -189,9 +189,16 @@ impl AlignJob {
         let found = submap::register(&self.theirs, &self.mine, &config).map_err(|error| match error {
             RegisterError::NoConsensus { .. } => RefusalReason::NoConsensus,
             RegisterError::Ambiguous { .. } => RefusalReason::Ambiguous,
-            RegisterError::Refine(_) => RefusalReason::Degenerate,
-            RegisterError::Solver(_) => RefusalReason::BadInput,
+            RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate,
+            RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit,
+            RegisterError::Refine(_) => RefusalReason::NoConsensus,
+            RegisterError::Solver(_) | RegisterError::Thinning { .. } | RegisterError::Crowded { .. } => {
+                RefusalReason::BadInput
+            }
         })?;
+        if found.log10_nfa > self.config.log10_nfa_max {
+            return Err(RefusalReason::NoConsensus);
+        }
         Ok(Measured {
             t_mine_theirs: Relative::Metric(found.refined.pose),
             sigma: found.refined.rms,

@@ -31,6 +31,8 @@ pub const VERIFICATIONS_MAX: usize = 1_024;
 pub const TRIED_MAX: usize = 1_000_000;
 /// Blobs fetched at once.
 pub const FETCHES_MAX: usize = 4;
+/// Blobs begun and not yet here, at most.
+pub const FETCHES_WAITING_MAX: usize = 64;
 /// Attempts after which a blob counts as out of reach, until a neighbour appears who may have it.
 pub const FETCH_ATTEMPTS_MAX: u32 = 6;
 /// Longest pause between two attempts to fetch one blob.
@@ -217,6 +219,13 @@ impl Negotiation {
         self.candidates.clear();
         self.wishes.clear();
         self.verify.clear();
+    }
+
+    /// Whether no further fetch is to be begun. Those that wait for a holder's link do not count, up to a limit: one
+    /// neighbour that puts everything off must not keep us from the blobs of others.
+    pub fn is_fetching_enough(&self, now: Instant) -> bool {
+        let live = self.fetches.values().filter(|fetch| fetch.query.is_some() || fetch.not_before <= now).count();
+        live >= 2 * FETCHES_MAX || self.fetches.len() >= FETCHES_WAITING_MAX
     }
 
     /// Notes the outcome of a fetch attempt that failed at `now`.

@@ -17,7 +17,7 @@ use std::collections::{BTreeMap, VecDeque};
 /// New entries of ours that wait for the link; of more the oldest are left to repair.
 pub const UNSENT_MAX: usize = 256;
 /// Times in a row that a piece of a blob may be put off; then its holder counts as one that does not have it.
-pub const POSTPONED_MAX: u32 = 32;
+pub const POSTPONED_MAX: u32 = 8;
 /// Pause after a piece of a blob was put off; it doubles...
 const POSTPONED_PAUSE: Duration = Duration::from_millis(500);
 /// ...so many times at most.

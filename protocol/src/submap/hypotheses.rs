@@ -13,8 +13,8 @@ const LENGTH_TOLERANCE: f64 = 1.5;
 const LENGTH_MIN: f64 = 4.0;
 /// Cosines of a pair agree within this.
 const COSINE_TOLERANCE: f64 = 0.3;
-/// Pairs that become poses at most.
-const POSES_MAX: usize = 2000;
+/// Pairs that are tried as poses at most.
+const POSES_MAX: usize = 1000;
 /// Pairs ranked at most; matches of the last keypoints are left out beyond it.
 const PAIRS_MAX: usize = 400_000;
 /// Two poses that place everything within this distance and angle (rad) are one.
@@ -33,12 +33,17 @@ pub fn hypotheses(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Vec<Pose
     let mut explained = vec![[0_u64; POSES_MAX.div_ceil(64)]; matches.len()];
     let mut members: Vec<Pairing> = Vec::new();
     let middle = theirs.points.iter().sum::<Vector3<f64>>() / theirs.points.len().max(1) as f64;
-    for (x, y) in agreement.ranked().into_iter().take(POSES_MAX) {
+    let mut tried = 0;
+    for (x, y) in agreement.ranked() {
         let (x, y) = (x as usize, y as usize);
-        // What an earlier pose explains leads to it again.
+        // What an earlier pose explains leads to it again, and must not use up the tries of others.
         if explained[x].iter().zip(&explained[y]).any(|(a, b)| a & b != 0) {
             continue;
         }
+        if tried == POSES_MAX {
+            break;
+        }
+        tried += 1;
         members.clear();
         members.extend([x, y].into_iter().chain(agreement.common(x, y)).map(|k| matches[k]));
         let Some(pose) = polished(theirs, mine, &members) else { continue };

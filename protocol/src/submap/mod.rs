@@ -13,6 +13,7 @@
 mod block;
 pub mod builder;
 mod cloud;
+mod court;
 pub mod describe;
 mod descriptor;
 pub mod features;

@@ -14,8 +14,9 @@ use std::collections::{BTreeMap, BTreeSet};
 pub struct Closed {
     /// The latest epoch that anybody handed an entry of to a disk, by origin.
     latest: BTreeMap<RobotId, u32>,
-    /// Every entry that was handed to a disk.
-    known: BTreeSet<(EntryId, Hash)>,
+    /// Every entry that was handed to a disk, and whether to one of another than its writer: only such a one can come
+    /// back. A process that died before its entry was on disk may well write the very same again.
+    known: BTreeMap<(EntryId, Hash), bool>,
     doubted: BTreeSet<RobotId>,
     forgers: BTreeSet<RobotId>,
     returned: BTreeMap<usize, Returned>,
@@ -35,11 +36,14 @@ struct Returned {
 impl Closed {
     fn persist(&mut self, robot: usize, batch: u64, id: EntryId, bytes: &[u8]) -> Result<(), String> {
         let (origin, epoch) = (id.frame.robot, id.frame.epoch);
-        let is_new = self.known.insert((id, Hash::of(bytes)));
         let returned = self.returned.entry(robot).or_default();
         let is_own = returned.robot == Some(origin);
+        let key = (id, Hash::of(bytes));
+        let is_new = !self.known.contains_key(&key);
+        let with_others = self.known.entry(key).or_default();
+        *with_others |= !is_own;
         if !is_new {
-            if is_own {
+            if is_own && *with_others {
                 returned.epoch = returned.epoch.max(Some(epoch));
                 returned.waiting.hand_over(batch, [epoch]);
             }
@@ -105,9 +109,13 @@ mod tests {
     const ME: RobotId = RobotId([1; 8]);
 
     fn persist(check: &mut Closed, epoch: u32, seq: u32) -> Result<(), String> {
+        persist_at(0, check, epoch, seq)
+    }
+
+    fn persist_at(robot: usize, check: &mut Closed, epoch: u32, seq: u32) -> Result<(), String> {
         let id = EntryId { frame: FrameId { robot: ME, epoch }, seq };
         let records = vec![Record::Entry { id, bytes: vec![epoch as u8, seq as u8] }];
-        check.see(0, &Seen::Output(&Output::Persist { batch: 1, records }))
+        check.see(robot, &Seen::Output(&Output::Persist { batch: 1, records }))
     }
 
     #[test]
@@ -132,6 +140,7 @@ mod tests {
             let mut check = Closed::default();
             check.see(0, &Seen::Started(ME)).unwrap();
             assert!(persist(&mut check, 5, 0).is_ok() && persist(&mut check, 5, 1).is_ok());
+            assert!(persist_at(1, &mut check, 5, 0).is_ok(), "a peer has it");
             check.see(0, &excused).unwrap();
             check.see(0, &Seen::Wiped).unwrap();
             assert!(persist(&mut check, 5, 0).is_ok(), "it comes back");
@@ -145,7 +154,7 @@ mod tests {
         for durable in [false, true] {
             let mut check = Closed::default();
             check.see(0, &Seen::Started(ME)).unwrap();
-            assert!(persist(&mut check, 5, 0).is_ok());
+            assert!(persist(&mut check, 5, 0).is_ok() && persist_at(1, &mut check, 5, 0).is_ok());
             check.see(0, &Seen::Wiped).unwrap();
             assert!(persist(&mut check, 5, 0).is_ok(), "it comes back");
             if durable {
@@ -155,6 +164,18 @@ mod tests {
             check.see(0, &Seen::Started(ME)).unwrap();
             assert_eq!(persist(&mut check, 5, 1).is_err(), durable);
         }
+    }
+
+    /// A cut within a commit takes an entry with it that nobody else can have; then it is written once more.
+    #[test]
+    fn what_nobody_else_has_does_not_come_back() {
+        let mut check = Closed::default();
+        check.see(0, &Seen::Started(ME)).unwrap();
+        assert!(persist(&mut check, 5, 0).is_ok() && persist_at(1, &mut check, 5, 0).is_ok());
+        assert!(persist(&mut check, 5, 1).is_ok());
+        check.see(0, &Seen::Died).unwrap();
+        check.see(0, &Seen::Started(ME)).unwrap();
+        assert!(persist(&mut check, 5, 1).is_ok() && persist(&mut check, 5, 2).is_ok());
     }
 
     #[test]
