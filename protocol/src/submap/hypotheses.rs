@@ -198,3 +198,40 @@ fn rotation_of(h: &Matrix3<f64>) -> Option<Matrix3<f64>> {
 
 /// The eigenvalue's share grows to its 2¹⁰th power.
 const SQUARINGS: usize = 10;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::So3;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    /// A hundred and twenty matches say one pose, a hundred and five the next bay: both must be found, though the pairs of
+    /// the first alone are more than are tried.
+    #[test]
+    fn many_matches_of_one_pose_do_not_hide_another() {
+        let mut dice = ChaCha8Rng::seed_from_u64(4);
+        let mut vector = |half: f64| Vector3::from_fn(|_, _| dice.random_range(-half..half));
+        let (mut theirs, mut mine) = (Cloud::default(), Cloud::default());
+        let rotation = So3::exp(&Vector3::new(0.2, -0.4, 1.1)).matrix();
+        let bays = [0.0, 25.0].map(|along| Pose { rotation, translation: Vector3::new(along, 3.0, -2.0) });
+        let mut matches = Vec::new();
+        for (bay, count) in bays.iter().zip([120, 105]) {
+            for _ in 0..count {
+                let (point, normal) = (vector(30.0), vector(1.0).normalize());
+                let k = theirs.points.len() as u32;
+                matches.push(Pairing { distance: 0, their: k, my: k });
+                theirs.points.push(point);
+                theirs.normals.push(normal);
+                mine.points.push(bay.apply(&point));
+                mine.normals.push(rotation * normal);
+            }
+        }
+        let found = hypotheses(&theirs, &mine, &matches);
+        for bay in &bays {
+            assert!(found.iter().any(|pose| !pose.differs(bay, &Vector3::zeros(), 0.1, 0.01)), "{bay:?}");
+        }
+        assert!(found.len() <= POSES_MAX);
+        assert!(hypotheses(&theirs, &mine, &[]).is_empty());
+    }
+}

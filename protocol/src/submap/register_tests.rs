@@ -1,5 +1,5 @@
 use super::super::Described;
-use super::super::testing::{config, moved_room, room, submap};
+use super::super::testing::{config, moved_room, room, room_points, submap};
 use super::*;
 use crate::submap::describe;
 
@@ -68,4 +68,33 @@ fn submaps_without_shape_are_refused_and_settings_checked() {
     bad.solver.sigma_max = f64::NAN;
     let refused = register(&room(1).keypoints, &room(1).features, &bad);
     assert!(matches!(refused, Err(RegisterError::Solver(AlignError::BadConfig { field: "sigma_max", .. }))));
+}
+
+/// Clouds that were thinned differently show different things; a little difference does no harm.
+#[test]
+fn clouds_of_other_voxels_are_refused() {
+    let theirs = |factor: f64| {
+        let mut config = config();
+        config.voxel_m *= factor;
+        describe(&submap(&room_points(6)), &config)
+    };
+    for (factor, refused) in [(0.6, true), (0.7, false), (1.45, false), (1.55, true)] {
+        let answer = registered(&theirs(factor), &room(6));
+        assert_eq!(matches!(answer, Err(RegisterError::Thinning { .. })), refused, "{factor}: {answer:?}");
+    }
+}
+
+/// Whoever repeats a keypoint would have it count more than once.
+#[test]
+fn keypoints_on_one_spot_are_refused() {
+    let mine = room(6);
+    let theirs = |share: f64| {
+        let mut keypoints = moved_room(6, Vector3::new(0.4, -0.3, 1.9), Vector3::new(0.3, 0.1, 0.05)).0.keypoints;
+        let (first, repeated) = (keypoints.0.points[0], (share * keypoints.len() as f64) as usize);
+        keypoints.0.points[..repeated].fill(first);
+        keypoints
+    };
+    let answer = |share| register(&theirs(share), &mine.features, &settings());
+    assert!(answer(0.05).is_ok());
+    assert!(matches!(answer(0.15), Err(RegisterError::Crowded { .. })));
 }
