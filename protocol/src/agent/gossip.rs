@@ -1,6 +1,6 @@
 //! How the agent talks (DESIGN §4): new entries of ours are published once; [`crate::gossip`] decides what else is said
-//! about facts, and [`super::traffic`] whether there is room for it; blobs are fetched on demand from whoever may have them. Pose beacons are hints: best effort, latest
-//! wins, never facts.
+//! about facts, and [`super::traffic`] whether there is room for it; blobs are fetched on demand from whoever may have
+//! them. Pose beacons are hints: best effort, latest wins, never facts.
 
 use super::Agent;
 use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
