@@ -286,6 +286,8 @@ pub struct FaultCounts {
     pub reordered: u64,
     /// Messages stopped by a partition, an isolation or a one-way link.
     pub blocked: u64,
+    /// Messages to a robot that the sender's radio no longer reaches.
+    pub out_of_reach: u64,
     /// Messages dropped because a link's queue was full.
     pub over_capacity: u64,
     /// Messages to a process that was not running.

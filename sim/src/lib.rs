@@ -11,6 +11,7 @@ pub mod check;
 pub mod core;
 pub mod dice;
 pub mod faults;
+pub mod field;
 pub mod network;
 pub mod queue;
 pub mod record;

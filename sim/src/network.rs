@@ -119,14 +119,24 @@ impl NetworkOptions {
 pub struct Network {
     options: NetworkOptions,
     robots: usize,
+    seed: u64,
     links: Vec<Link>,
+    /// For each robot, those whom its radio reaches, in order; `None`: all of them.
+    reach: Option<Vec<Vec<usize>>>,
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 struct Link {
-    dice: Dice,
     /// How many faults block it at present.
     blocks: u32,
+    /// Made when first used: most links of a large swarm are never in reach.
+    air: Option<Box<Air>>,
+}
+
+/// What becomes of the messages on a link.
+#[derive(Clone, Debug)]
+struct Air {
+    dice: Dice,
     /// When its queue will be empty.
     free_at: Instant,
     burst: [Instant; 2],
@@ -135,13 +145,7 @@ struct Link {
 impl Network {
     /// Links between `robots` robots.
     pub fn new(options: NetworkOptions, robots: usize, seed: u64) -> Self {
-        let link = |index: usize| Link {
-            dice: Dice::new(seed, &format!("link {} {}", index / robots, index % robots)),
-            blocks: 0,
-            free_at: Instant::ZERO,
-            burst: [Instant::ZERO; 2],
-        };
-        Self { options, robots, links: (0..robots * robots).map(link).collect() }
+        Self { options, robots, seed, links: vec![Link::default(); robots * robots], reach: None }
     }
 
     /// The options in force.
@@ -149,7 +153,24 @@ impl Network {
         &self.options
     }
 
-    /// Ends loss, bursts, duplication, reordering and caps, and unblocks every link.
+    /// Whom each robot's radio reaches, from now on.
+    pub fn set_reach(&mut self, reach: Vec<Vec<usize>>) {
+        self.reach = Some(reach);
+    }
+
+    /// Whom the radio of `from` reaches, blocked or not, in order.
+    pub fn in_reach(&self, from: usize) -> Vec<usize> {
+        match &self.reach {
+            Some(reach) => reach[from].clone(),
+            None => (0..self.robots).filter(|to| *to != from).collect(),
+        }
+    }
+
+    fn reaches(&self, from: usize, to: usize) -> bool {
+        self.reach.as_ref().map_or(from != to, |reach| reach[from].binary_search(&to).is_ok())
+    }
+
+    /// Ends loss, bursts, duplication, reordering and caps, and unblocks every link; reach stays what it is.
     pub fn heal(&mut self) {
         self.options = self.options.healed();
         self.links.iter_mut().for_each(|link| link.blocks = 0);
@@ -163,7 +184,7 @@ impl Network {
 
     /// Whether messages can pass.
     pub fn is_open(&self, from: usize, to: usize) -> bool {
-        from != to && self.links[from * self.robots + to].blocks == 0
+        self.reaches(from, to) && self.links[from * self.robots + to].blocks == 0
     }
 
     /// Sends a message of `bytes` bytes: the times at which copies of it arrive.
@@ -175,25 +196,29 @@ impl Network {
         bytes: usize,
         counts: &mut FaultCounts,
     ) -> Vec<Instant> {
+        if !self.reaches(from, to) {
+            counts.out_of_reach += 1;
+            return Vec::new();
+        }
         if !self.is_open(from, to) {
             counts.blocked += 1;
             return Vec::new();
         }
         let options = &self.options;
-        let link = &mut self.links[from * self.robots + to];
-        let Some(sent) = link.queue(now, bytes, options) else {
+        let air = self.links[from * self.robots + to].air(self.seed, from, to);
+        let Some(sent) = air.queue(now, bytes, options) else {
             counts.over_capacity += 1;
             return Vec::new();
         };
-        let lost = link.dice.chance(options.loss);
-        let burst = link.in_burst(now, options) && link.dice.chance(options.burst_loss);
+        let lost = air.dice.chance(options.loss);
+        let burst = air.in_burst(now, options) && air.dice.chance(options.burst_loss);
         if lost || burst {
             *(if lost { &mut counts.lost } else { &mut counts.burst_lost }) += 1;
             return Vec::new();
         }
-        let copies = if link.dice.chance(options.duplicate) { 2 } else { 1 };
+        let copies = if air.dice.chance(options.duplicate) { 2 } else { 1 };
         counts.duplicated += copies - 1;
-        (0..copies).map(|_| sent.after(link.delay(options, counts))).collect()
+        (0..copies).map(|_| sent.after(air.delay(options, counts))).collect()
     }
 }
 
@@ -213,7 +238,7 @@ impl Network {
         if (options.mangle <= 0.0 && options.replay <= 0.0) || !self.is_open(from, to) {
             return None;
         }
-        let dice = &mut self.links[from * self.robots + to].dice;
+        let dice = &mut self.links[from * self.robots + to].air(self.seed, from, to).dice;
         if dice.chance(options.mangle) {
             let at = now.after(millis(dice.range(1.0, 500.0)));
             return Some(Tampering::Mangled(at, dice.bits()));
@@ -223,6 +248,14 @@ impl Network {
 }
 
 impl Link {
+    fn air(&mut self, seed: u64, from: usize, to: usize) -> &mut Air {
+        let dice = || Dice::new(seed, &format!("link {from} {to}"));
+        self.air
+            .get_or_insert_with(|| Box::new(Air { dice: dice(), free_at: Instant::ZERO, burst: [Instant::ZERO; 2] }))
+    }
+}
+
+impl Air {
     /// When the last byte has left; `None` if the queue is full.
     fn queue(&mut self, now: Instant, bytes: usize, options: &NetworkOptions) -> Option<Instant> {
         if options.bytes_per_sec <= 0.0 {
@@ -362,5 +395,18 @@ mod tests {
         assert_eq!(counts.blocked, 1);
         network.heal();
         assert_eq!(network.send(Instant::ZERO, 0, 1, 1, &mut counts).len(), 1, "healed of block and loss");
+    }
+
+    #[test]
+    fn what_a_radio_does_not_reach_is_no_fault_and_stays_so_when_faults_heal() {
+        let mut network = Network::new(NetworkOptions::default(), 3, 1);
+        assert_eq!(network.in_reach(1), [0, 2]);
+        network.set_reach(vec![vec![1], vec![0, 2], vec![1]]);
+        network.heal();
+        let mut counts = FaultCounts::default();
+        assert!(network.is_open(0, 1) && !network.is_open(0, 2));
+        assert!(network.send(Instant::ZERO, 0, 2, 1, &mut counts).is_empty());
+        assert_eq!((counts.out_of_reach, counts.blocked), (1, 0));
+        assert_eq!(network.in_reach(1), [0, 2]);
     }
 }

@@ -2,6 +2,7 @@
 //! unknown keys and impossible values are refused with the key's name and what to write instead.
 
 use crate::faults::Fault;
+use crate::field::Layout;
 use crate::network::NetworkOptions;
 use crate::world::WorldOptions;
 use crate::world::drive::DriveOptions;
@@ -48,6 +49,9 @@ pub struct Scenario {
     /// What lies between them.
     #[serde(default)]
     pub network: NetworkOptions,
+    /// Who is in reach of whom: all, unless told otherwise.
+    #[serde(default)]
+    pub radio: Layout,
     /// Their computers.
     #[serde(default)]
     pub machine: MachineOptions,
@@ -192,7 +196,7 @@ impl Scenario {
         }
         range("expect.error_max_m", self.expect.error_max_m, 1e-6, 1e6, "use a positive length")?;
         range("expect.error_max_deg", self.expect.error_max_deg, 1e-6, 180.0, "use 0 to 180 degrees")?;
-        for (key, value, low, high, mend) in self.network.ranges() {
+        for (key, value, low, high, mend) in self.network.ranges().into_iter().chain(self.radio.ranges()) {
             range(key, value, low, high, mend)?;
         }
         self.config.validate()?;
@@ -286,6 +290,12 @@ mod tests {
             ("[network]\nloss = 1.5", "network.loss = 1.5", "0 to 1"),
             ("[network]\nloss = nan", "network.loss = NaN", "0 to 1"),
             ("[world]\nloop_radius_m = 0.5", "world.loop_radius_m = 0.5", "2 to 1000"),
+            (
+                "[radio]\nlayout = \"waypoints\"\nside_m = 9.0\nrange_m = 0.0\nspeed_m_s = 1.0",
+                "radio.range_m = 0",
+                "0.1 to",
+            ),
+            ("[radio]\nlayout = \"star\"", "star", "expected one of"),
             ("[sensor]\nrange_m = [5.0, 1.0]", "sensor.range_m[0] = 5", "shortest"),
             ("[config.submap]\nvoxel_m = 0.0", "config.submap.voxel_m = 0", "0.001 to 10"),
             ("[config]\nvoxel = 1", "voxel", "unknown field"),

@@ -6,5 +6,5 @@ pub mod command;
 mod draw;
 mod run;
 
-pub use draw::{SETTLE_SECS, draw};
+pub use draw::{draw, settle_secs};
 pub use run::{SeedReport, Tally, run_seed};

@@ -4,6 +4,7 @@
 
 use crate::bar::progress_bar;
 use crate::faults::Fault;
+use crate::field::Layout;
 use crate::network::NetworkOptions;
 use crate::scenario::{Expect, MachineOptions, Scenario, SummaryOptions};
 use crate::swarm::Swarm;
@@ -100,6 +101,7 @@ fn scenario(robots: usize, flooded: bool) -> Scenario {
     config.submap.keypoints = 16;
     config.align.candidates_max = 24;
     let mut scenario = Scenario {
+        radio: Layout::Mesh,
         name: "flood".into(),
         about: "halves that heal in a flood of strangers".into(),
         robots,

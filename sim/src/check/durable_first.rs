@@ -25,7 +25,7 @@ pub struct DurableFirst {
 #[derive(Debug, Default)]
 struct Robot {
     /// Records handed to the disk, by batch.
-    waiting: VecDeque<(u64, Vec<Vec<u8>>)>,
+    waiting: VecDeque<(u64, Needles)>,
     /// Records the disk holds: one may be stored twice.
     durable: BTreeSet<Hash>,
     sent: VecDeque<Vec<u8>>,
@@ -49,27 +49,26 @@ impl Check for DurableFirst {
                 let of_others =
                     |bytes: &Vec<u8>| Entry::decode(bytes).ok().is_none_or(|e| e.id().frame.robot != *origin);
                 let waiting = self.robots.values_mut().flat_map(|robot| &mut robot.waiting);
-                waiting.for_each(|(_, needles)| needles.retain(of_others));
+                waiting.for_each(|(_, needles)| needles.list.retain(of_others));
             }
             Seen::Durable(batch) => {
                 while state.waiting.front().is_some_and(|(number, _)| number <= batch) {
-                    let records = state.waiting.pop_front().map(|(_, records)| records).unwrap_or_default();
+                    let records = state.waiting.pop_front().map(|(_, needles)| needles.list).unwrap_or_default();
                     state.durable.extend(records.iter().map(|bytes| Hash::of(bytes)));
                 }
             }
             Seen::Output(Output::Persist { batch, records }) => {
                 let new = |bytes: &Vec<u8>| !state.durable.contains(&Hash::of(bytes));
-                let needles: Vec<Vec<u8>> =
-                    records.iter().filter_map(|r| sendable(r, &self.doubted)).filter(new).collect();
-                if let Some(needle) = needles.iter().find(|n| state.sent.iter().any(|message| contains(message, n))) {
+                let needles: Needles = records.iter().filter_map(|r| sendable(r, &self.doubted)).filter(new).collect();
+                if let Some(needle) = state.sent.iter().find_map(|message| needles.within(message).next()) {
                     return Err(format!("robot {robot}: sent {} B before it stored them", needle.len()));
                 }
                 state.waiting.push_back((*batch, needles));
             }
             Seen::Output(Output::Publish { bytes, .. } | Output::Answer { bytes, .. } | Output::Ask { bytes, .. }) => {
                 for (batch, needles) in &state.waiting {
-                    let leaked = |n: &&Vec<u8>| contains(bytes, n) && !state.durable.contains(&Hash::of(n));
-                    if let Some(needle) = needles.iter().find(leaked) {
+                    let leaked = |n: &&Vec<u8>| !state.durable.contains(&Hash::of(n));
+                    if let Some(needle) = needles.within(bytes).find(leaked) {
                         return Err(format!(
                             "robot {robot}: sent a record of {} B while batch {batch} that holds it is not durable",
                             needle.len()
@@ -97,12 +96,38 @@ fn sendable(record: &Record, doubted: &BTreeSet<RobotId>) -> Option<Vec<u8>> {
     }
 }
 
-/// Records end in a signature or in payload, so their last bytes tell them apart sooner than their headers do.
-fn contains(haystack: &[u8], needle: &[u8]) -> bool {
-    let Some((start, tail)) = needle.split_last_chunk::<8>() else { return false };
-    let is_here =
-        |window: &[u8]| window.split_last_chunk::<8>().is_some_and(|(begin, end)| end == tail && begin == start);
-    haystack.windows(needle.len()).any(is_here)
+/// Records of one batch, to be looked for in messages in one go. They end in a signature or in payload, so their last
+/// bytes tell them apart sooner than their headers do.
+#[derive(Debug, Default)]
+struct Needles {
+    list: Vec<Vec<u8>>,
+    /// A bit for each two bytes that a record ends in.
+    ends: Vec<u64>,
+}
+
+impl FromIterator<Vec<u8>> for Needles {
+    fn from_iter<I: IntoIterator<Item = Vec<u8>>>(records: I) -> Self {
+        let list: Vec<Vec<u8>> = records.into_iter().collect();
+        let mut ends = vec![0; (1 << 16) / 64];
+        for end in list.iter().filter_map(|record| record.last_chunk::<2>()) {
+            let end = u16::from_le_bytes(*end);
+            ends[usize::from(end / 64)] |= 1 << (end % 64);
+        }
+        Self { list, ends }
+    }
+}
+
+impl Needles {
+    /// The records that the message contains.
+    fn within<'a>(&'a self, message: &'a [u8]) -> impl Iterator<Item = &'a Vec<u8>> {
+        let ends_one = |pair: &[u8]| {
+            let end = pair.first_chunk::<2>().map_or(0, |pair| u16::from_le_bytes(*pair));
+            self.ends[usize::from(end / 64)] >> (end % 64) & 1 == 1
+        };
+        let pairs = if self.list.is_empty() { [].windows(2) } else { message.windows(2) };
+        let heads = pairs.enumerate().filter(move |(_, pair)| ends_one(pair)).map(|(at, _)| &message[..at + 2]);
+        heads.flat_map(|head| self.list.iter().filter(move |record| head.ends_with(record)))
+    }
 }
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ impl<C: Core> Swarm<C> {
         let tells_two = one.equivocates && channel == Channel::Facts;
         let other = tells_two.then(|| hostile::second_story(&bytes, &one.identity.secret_key)).flatten();
         self.counts.equivocations += u64::from(other.is_some());
-        for to in (0..self.robots.len()).filter(|&to| to != robot) {
+        for to in self.network.in_reach(robot) {
             let bytes = other.as_ref().filter(|_| to % 2 == 1).unwrap_or(&bytes);
             for at in self.network.send(now, robot, to, bytes.len(), &mut self.counts) {
                 self.queue.push(at, Event::Broadcast { from: robot, to, channel, bytes: bytes.clone() });
@@ -100,7 +100,7 @@ impl<C: Core> Swarm<C> {
             }
             Event::Hear { observer, subject, version } => {
                 let id = self.robots[subject].id;
-                let hearing = &mut self.robots[observer].hears[subject];
+                let hearing = self.robots[observer].hears.entry(subject).or_default();
                 if hearing.version == version && hearing.told != hearing.so {
                     hearing.told = hearing.so;
                     let up = hearing.so;
@@ -166,7 +166,7 @@ impl<C: Core> Swarm<C> {
     }
 
     /// Whose drive a robot is on: its own, or that of the robot it is the twin of.
-    fn drives(&self, robot: usize) -> usize {
+    pub(super) fn drives(&self, robot: usize) -> usize {
         self.ids.get(&self.robots[robot].id).copied().unwrap_or(robot)
     }
 

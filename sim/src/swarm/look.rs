@@ -4,9 +4,14 @@ use super::robot::Robot;
 use super::{Event, Swarm, all_agree, all_done};
 use crate::check::{Phase, RobotSample, Sample, Seen};
 use crate::core::Core;
+use crate::field::TICK;
 use crate::network::millis;
 use merganser_protocol::snapshot::SubmapView;
 use merganser_protocol::time::Instant;
+use std::collections::BTreeSet;
+
+/// Between two samples at most, s.
+const SAMPLE_SECS_MAX: f64 = 20.0;
 
 impl<C: Core> Swarm<C> {
     /// Notices who can hear whom, and plans to tell those for whom it changed.
@@ -14,12 +19,14 @@ impl<C: Core> Swarm<C> {
         let options = self.network.options().clone();
         let alive: Vec<bool> = self.robots.iter().map(|r| r.core.is_some() && now >= r.paused_until).collect();
         for observer in 0..alive.len() {
-            for (subject, &subject_alive) in alive.iter().enumerate() {
-                let running = self.robots[observer].core.is_some();
+            let running = self.robots[observer].core.is_some();
+            let known = self.robots[observer].hears.keys().copied();
+            let subjects: BTreeSet<usize> = known.chain(self.network.in_reach(observer)).collect();
+            for subject in subjects {
                 // Two robots under one name look like one: that a twin comes or goes, nobody sees.
                 let shows = self.robots[subject].twin.is_none() && self.robots[subject].id != self.robots[observer].id;
-                let so = running && subject_alive && shows && self.network.is_open(subject, observer);
-                let hearing = &mut self.robots[observer].hears[subject];
+                let so = running && alive[subject] && shows && self.network.is_open(subject, observer);
+                let hearing = self.robots[observer].hears.entry(subject).or_default();
                 if hearing.so == so {
                     continue;
                 }
@@ -28,6 +35,17 @@ impl<C: Core> Swarm<C> {
                 let delay = millis(if so { options.discover_ms } else { options.lease_ms });
                 self.queue.push(now.after(delay), Event::Hear { observer, subject, version: hearing.version });
             }
+        }
+    }
+
+    /// Robots drive on, and radios reach others.
+    pub(super) fn move_on(&mut self, now: Instant) {
+        self.field.drive(now.as_secs_f64(), TICK);
+        let place: Vec<usize> = (0..self.robots.len()).map(|robot| self.drives(robot)).collect();
+        self.network.set_reach(self.field.reach(&place));
+        self.update_hearing(now);
+        if self.field.moves() {
+            self.queue.push(now.after(millis(1e3 * TICK)), Event::Move);
         }
     }
 
@@ -44,7 +62,7 @@ impl<C: Core> Swarm<C> {
             self.violation.get_or_insert(violation);
         }
         // A snapshot costs more the more robots there are, and there are as many of them.
-        let pause = (0.2 * self.robots.len() as f64).max(1.0);
+        let pause = (0.2 * self.robots.len() as f64).clamp(1.0, SAMPLE_SECS_MAX);
         self.queue.push(now.after(millis(1e3 * pause)), Event::Sample);
     }
 

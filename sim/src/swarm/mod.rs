@@ -21,6 +21,7 @@ use crate::check::{Checks, Phase, RobotSample, Sample, Violation};
 use crate::core::Core;
 use crate::dice::Dice;
 use crate::faults::FaultCounts;
+use crate::field::{Field, Layout};
 use crate::network::{Network, millis};
 use crate::queue::Queue;
 use crate::scenario::Scenario;
@@ -31,7 +32,7 @@ use merganser_protocol::agent::job::Job;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::ids::{NameError, RobotId};
 use merganser_protocol::time::Instant;
-use robot::{Hearing, Robot, Slam, identities};
+use robot::{Robot, Slam, identities};
 use standin::StandIn;
 use std::collections::BTreeMap;
 use thiserror::Error;
@@ -66,6 +67,7 @@ pub struct Swarm<C> {
     seed: u64,
     queue: Queue<Event>,
     network: Network,
+    field: Field,
     robots: Vec<Robot<C>>,
     ids: BTreeMap<RobotId, usize>,
     checks: Checks,
@@ -138,6 +140,7 @@ enum Event {
     FaultEnds(usize),
     Flood(usize),
     Heal,
+    Move,
     Sample,
 }
 
@@ -168,8 +171,6 @@ impl<C: Core> Swarm<C> {
         }
         let members = robots.len();
         Self::with_twins(&mut robots, &scenario);
-        let all = robots.len();
-        robots.iter_mut().for_each(|robot| robot.hears.resize(all, Hearing::default()));
         for (index, fault) in scenario.faults.iter().enumerate() {
             queue.push(secs(fault.begins()), Event::FaultBegins(index));
             if let Some(ends) = fault.ends() {
@@ -178,7 +179,11 @@ impl<C: Core> Swarm<C> {
         }
         queue.push(secs(scenario.duration_secs + scenario.machine.start_within_secs), Event::Heal);
         queue.push(secs(1.0), Event::Sample);
+        if scenario.radio != Layout::Mesh {
+            queue.push(Instant::ZERO, Event::Move);
+        }
         Ok(Self {
+            field: Field::new(scenario.radio, members, seed),
             network: Network::new(scenario.network.clone(), robots.len(), seed),
             ids: robots.iter().take(members).enumerate().map(|(index, robot)| (robot.id, index)).collect(),
             standin: scenario.summary.clone().map(|options| StandIn::new(options, seed)),
@@ -294,6 +299,7 @@ impl<C: Core> Swarm<C> {
             Event::FaultBegins(index) => self.fault_begins(now, index),
             Event::FaultEnds(index) => self.fault_ends(now, index)?,
             Event::Heal => self.heal(now)?,
+            Event::Move => self.move_on(now),
             Event::Sample => self.sample(now),
             Event::Flood(index) => self.flood(now, index),
             other => self.deliver(now, other),
@@ -323,6 +329,7 @@ impl Event {
             | Self::FaultEnds(_)
             | Self::Flood(_)
             | Self::Heal
+            | Self::Move
             | Self::Sample => None,
         }
     }

@@ -54,8 +54,8 @@ pub(super) struct Robot<C> {
     pub asked: BTreeMap<u64, Asked>,
     pub tokens: u64,
     pub workers: Vec<Instant>,
-    /// One for each robot of the run.
-    pub hears: Vec<Hearing>,
+    /// Whom it hears, or once heard.
+    pub hears: BTreeMap<usize, Hearing>,
     pub usage: BTreeMap<&'static str, Usage>,
     pub keyframes: u64,
 }
@@ -121,7 +121,7 @@ impl<C> Robot<C> {
             asked: BTreeMap::new(),
             tokens: 0,
             workers: vec![Instant::ZERO; scenario.machine.workers],
-            hears: Vec::new(),
+            hears: BTreeMap::new(),
             usage: BTreeMap::new(),
             keyframes: 0,
         }
@@ -153,7 +153,7 @@ impl<C> Robot<C> {
         self.questions.clear();
         self.asked.clear();
         self.workers.fill(now);
-        for hearing in &mut self.hears {
+        for hearing in self.hears.values_mut() {
             *hearing = Hearing { version: hearing.version + 1, ..Hearing::default() };
         }
     }

@@ -1,6 +1,6 @@
 //! `merganser-sim vopr`: one seed, told in full, or a band of them, told in sum.
 
-use super::{SETTLE_SECS, SeedReport, Tally, draw, run_seed};
+use super::{SeedReport, Tally, draw, run_seed, settle_secs};
 use crate::band::{Band, parse_band};
 use crate::bar::progress_bar;
 use crate::check::Violation;
@@ -72,13 +72,14 @@ pub fn run(args: &VoprArgs) -> anyhow::Result<bool> {
     }
     say(&format!(
         "{} seeds, {} broken; {:.0} virtual s in {wall:.1} s ({:.2} s a seed); slowest to agree after the \
-         healing: {:.1} s (seed {}), allowed {SETTLE_SECS} s",
+         healing: {:.1} s (seed {}), allowed {:.0} s",
         tally.seeds,
         tally.broken.len(),
         tally.virtual_secs,
         wall / tally.seeds.max(1) as f64,
         tally.slowest.0,
-        tally.slowest.1
+        tally.slowest.1,
+        settle_secs(robots.unwrap_or_default())
     ))?;
     if let Some(path) = &args.report {
         let text = serde_json::to_string_pretty(&tally)? + "\n";

@@ -2,14 +2,24 @@
 
 use crate::dice::Dice;
 use crate::faults::Fault;
+use crate::field::Layout;
 use crate::network::NetworkOptions;
 use crate::scenario::{Expect, MachineOptions, Scenario, SummaryOptions};
 use crate::world::WorldOptions;
 use crate::world::drive::DriveOptions;
 use merganser_protocol::config::Config;
 
-/// The stated bound: within this time of the healing, all hold the same facts, virtual s.
-pub const SETTLE_SECS: f64 = 60.0;
+/// The stated bound: within this time of the healing, all hold the same facts, virtual s...
+const SETTLE_SECS: f64 = 60.0;
+/// ...and in a crowd this much later for each row of robots that facts have to cross.
+const ROW_SECS: f64 = 3.0;
+/// More robots than this are a crowd: not all are in reach of all, and faults come in rounds, one for so many robots.
+const CROWD: usize = 10;
+const ROUNDS_MAX: usize = 10;
+/// Share of the crowds that drive about; the others stand on a grid.
+const MOVING_SHARE: f64 = 0.5;
+/// How many a robot that drives about has in reach, on average.
+const IN_REACH: f64 = 12.0;
 /// Share of the runs in which robots also align, merge and solve.
 const SOLVE_SHARE: f64 = 0.15;
 /// Share of the runs in which robots may send little, and how little, B/s.
@@ -17,6 +27,11 @@ const SLOW_LINK_SHARE: f64 = 0.25;
 const SLOW_LINK: [f64; 2] = [4_000.0, 40_000.0];
 /// Faults begin after this, s: robots boot first.
 const CALM_SECS: f64 = 2.0;
+
+/// Within this time of the healing all must hold the same facts, virtual s.
+pub fn settle_secs(robots: usize) -> f64 {
+    if robots <= CROWD { SETTLE_SECS } else { SETTLE_SECS + ROW_SECS * libm::sqrt(robots as f64) }
+}
 
 /// The run that a seed stands for; of so many robots, if that is given, else of 2 to 10.
 pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
@@ -30,7 +45,7 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
         about: "drawn from the seed".into(),
         robots,
         duration_secs,
-        settle_secs: SETTLE_SECS,
+        settle_secs: settle_secs(robots),
         world: WorldOptions {
             boxes_per_100m2: 0.0,
             pillars_per_100m2: 0.0,
@@ -40,6 +55,7 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
         drive: DriveOptions { keyframe_m: dice.range(1.0, 3.0), ..DriveOptions::default() },
         sensor: crate::world::sensor::SensorOptions::default(),
         summary: None,
+        radio: radio(robots, &mut Dice::new(seed, "vopr radio")),
         network: network(&mut Dice::new(seed, "vopr network")),
         machine: machine(&mut Dice::new(seed, "vopr machines")),
         expect: Expect::default(),
@@ -51,6 +67,18 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
     scenario.summary = Some(SummaryOptions { solve, liars, ..SummaryOptions::default() });
     scenario.faults = faults(&scenario, seed, solve);
     scenario
+}
+
+fn radio(robots: usize, dice: &mut Dice) -> Layout {
+    let (moving, range_m, speed_m_s) = (dice.chance(MOVING_SHARE), dice.range(10.0, 100.0), dice.range(0.5, 5.0));
+    match (robots > CROWD, moving) {
+        (false, _) => Layout::Mesh,
+        (true, false) => Layout::Grid,
+        (true, true) => {
+            let side_m = range_m * libm::sqrt(core::f64::consts::PI * robots as f64 / IN_REACH);
+            Layout::Waypoints { side_m, range_m, speed_m_s }
+        }
+    }
 }
 
 fn network(dice: &mut Dice) -> NetworkOptions {
@@ -130,17 +158,20 @@ struct Faults<'a> {
 fn faults(scenario: &Scenario, seed: u64, solve: bool) -> Vec<Fault> {
     let dice = Dice::new(seed, "vopr faults");
     let mut drawn = Faults { dice, names: scenario.names(), scenario, faults: Vec::new() };
-    drawn.links();
-    drawn.processes();
-    drawn.disks();
-    // Where frames lie is known by the name of robot and epoch: runs that are about the map leave out what can give
-    // one name to two frames.
-    if !solve {
-        drawn.doubtful_disks();
-        drawn.members();
+    let rounds = (scenario.robots / CROWD).clamp(1, ROUNDS_MAX);
+    for _ in 0..rounds {
+        drawn.links();
+        drawn.processes();
+        drawn.disks();
+        // Where frames lie is known by the name of robot and epoch: runs that are about the map leave out what can
+        // give one name to two frames.
+        if !solve {
+            drawn.doubtful_disks();
+            drawn.members();
+        }
     }
     drawn.dice = Dice::new(seed, "vopr new frames");
-    drawn.new_frames();
+    (0..rounds).for_each(|_| drawn.new_frames());
     drawn.faults.sort_by(|a, b| a.begins().total_cmp(&b.begins()));
     drawn.faults
 }
@@ -332,6 +363,19 @@ mod tests {
             let read = Scenario::parse(&text).unwrap_or_else(|error| panic!("seed {seed}: {error}\n{text}"));
             assert_eq!(read, draw(seed, None), "seed {seed}: what is printed is what is run");
         }
+    }
+
+    #[test]
+    fn crowds_stand_or_drive_out_of_reach_of_most_and_more_befalls_them() {
+        let crowds: Vec<Scenario> = (0..20).map(|seed| draw(seed, Some(100))).collect();
+        for crowd in &crowds {
+            assert_eq!(Scenario::parse(&toml::to_string(crowd).unwrap()).unwrap(), *crowd);
+        }
+        assert!(crowds.iter().any(|crowd| crowd.radio == Layout::Grid));
+        assert!(crowds.iter().any(|crowd| matches!(crowd.radio, Layout::Waypoints { .. })));
+        let faults = |robots| (0..20).map(|seed| draw(seed, robots).faults.len()).sum::<usize>();
+        assert!(faults(Some(100)) > 5 * faults(Some(CROWD)));
+        assert_eq!(draw(0, Some(CROWD)).radio, Layout::Mesh);
     }
 
     #[test]

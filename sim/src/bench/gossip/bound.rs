@@ -1,12 +1,13 @@
 //! What no gossip can beat where contacts come and go: robots in touch, directly or through others, share all they hold
 //! at once, and nothing is lost. The distance to it is the gossip's; the rest is the world's.
 
-use super::field::{Field, TICK, World};
+use super::case::World;
 use super::run::Outcome;
+use crate::field::{Field, TICK};
 
 /// The bound of one world; `None` where links do not change, for there it is nothing.
 pub fn bound(world: &World, seed: u64) -> Option<Outcome> {
-    let mut field = Field::new(world, seed);
+    let mut field = Field::new(world.layout, world.robots, seed);
     if !field.moves() {
         return None;
     }

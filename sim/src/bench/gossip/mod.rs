@@ -4,7 +4,7 @@
 //! hashes to whoever differs. Where contacts come and go, the time that no gossip can beat is told as well.
 
 mod bound;
-mod field;
+mod case;
 mod plain;
 mod policy;
 mod radio;
@@ -12,7 +12,7 @@ mod run;
 #[cfg(test)]
 mod tests;
 
-pub use field::Case;
+pub use case::Case;
 pub use run::{Outcome, Shared, measure, share};
 
 use crate::bar::progress_bar;

@@ -1,9 +1,10 @@
 //! One swarm from the start until all sets are equal.
 
-use super::field::{Field, Layout, TICK, World};
+use super::case::World;
 use super::policy::{Gossip, Policy};
 use super::radio::Radio;
 use crate::dice::Dice;
+use crate::field::{Field, Layout, TICK};
 use crate::queue::Queue;
 use anyhow::Context;
 use core::time::Duration;
@@ -202,7 +203,7 @@ impl<'a> Swarm<'a> {
         Ok(Self {
             world,
             nodes: keys.iter().map(node).collect::<Result<_, _>>()?,
-            field: Field::new(world, seed),
+            field: Field::new(world.layout, world.robots, seed),
             radio: Radio::new(world.robots, world.loss, seed),
             queue: Queue::new(),
             rng: ChaCha8Rng::seed_from_u64(seed),

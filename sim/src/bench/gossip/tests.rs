@@ -1,12 +1,13 @@
 //! The bench itself: a run is a function of its seed, sets do become equal, and a gossip that never asks is found out.
 
 use super::bound::bound;
-use super::field::{Case, Layout};
+use super::case::{Case, World};
 use super::measure;
 use super::policy::Policy;
+use crate::field::Layout;
 
-fn small(case: Case) -> super::field::World {
-    super::field::World { robots: 16, ..case.world() }
+fn small(case: Case) -> World {
+    World { robots: 16, ..case.world() }
 }
 
 #[test]
@@ -31,13 +32,13 @@ fn every_case_converges_with_either_gossip_and_moves_at_least_what_is_needed() {
 
 #[test]
 fn halves_that_stay_cut_do_not_converge() {
-    let world = super::field::World { heal_at: 1e9, fact_every_secs: 0.0, until: 200.0, ..small(Case::Split) };
+    let world = World { heal_at: 1e9, fact_every_secs: 0.0, until: 200.0, ..small(Case::Split) };
     assert!(!measure(&world, Policy::Ours, 1).unwrap().converged());
 }
 
 #[test]
 fn a_quiet_swarm_is_measured_after_it_settled() {
-    let world = super::field::World { until: 200.0, ..small(Case::Steady) };
+    let world = World { until: 200.0, ..small(Case::Steady) };
     let outcome = measure(&world, Policy::Ours, 1).unwrap();
     assert!(outcome.steady.is_some_and(|rate| rate > 0.0 && rate < 50.0), "{outcome}");
 }
