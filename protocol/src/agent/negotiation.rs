@@ -297,6 +297,20 @@ mod tests {
     }
 
     #[test]
+    fn fetches_that_wait_for_a_link_stop_no_others_up_to_a_limit() {
+        let later = Instant::ZERO.after(Duration::from_secs(5));
+        for (not_before, limit) in [(later, FETCHES_WAITING_MAX), (Instant::ZERO, 2 * FETCHES_MAX)] {
+            let mut n = Negotiation::default();
+            for k in 0..limit {
+                assert!(!n.is_fetching_enough(Instant::ZERO), "{k} of {limit}");
+                let fetch = Fetch { not_before, ..Fetch::new(RobotId([2; 8]), Instant::ZERO) };
+                n.fetches.insert(Hash::of(&k.to_le_bytes()), fetch);
+            }
+            assert!(n.is_fetching_enough(Instant::ZERO));
+        }
+    }
+
+    #[test]
     fn a_failing_fetch_backs_off_and_is_given_up_at_the_bound() {
         let mut n = Negotiation::default();
         let (hash, query) = (Hash::of(b"x"), QueryId(7));

@@ -280,7 +280,8 @@ fn block(columns: &[Vec<f32>; 3], start: usize) -> [&[f32; 64]; 3] {
     columns.each_ref().map(|column| column[start..].first_chunk().unwrap_or(&EMPTY))
 }
 
-/// e^{−x} for 0 ≤ x ≤ [`EXPONENT_GATE`] within 1e-4 of the value: the Taylor polynomial of e^{−x/8}, to the eighth power.
+/// e^{−x} for 0 ≤ x ≤ [`EXPONENT_GATE`] within 1e-4 of the value: the Taylor polynomial of e^{−x/8}, to the eighth
+/// power.
 #[inline(always)]
 fn exp_negative(x: f32) -> f32 {
     let y = x * 0.125;

@@ -1,8 +1,9 @@
 //! Which pairs of matches agree at which scale: the scale-invariant counterpart of equal lengths.
 //!
-//! A pair with source length d and target length e votes for the scales from (e − τ)/d to (e + τ)/d. The range of scales is
-//! cut into bins no wider than the votes of typical pairs, and each pair's first and last bin are noted once; the pairs
-//! that agree at the scale of a bin are then read off by comparing bytes, and form a graph as sparse as a rigid motion's.
+//! A pair with source length d and target length e votes for the scales from (e − τ)/d to (e + τ)/d. The range of
+//! scales is cut into bins no wider than the votes of typical pairs, and each pair's first and last bin are noted once;
+//! the pairs that agree at the scale of a bin are then read off by comparing bytes, and form a graph as sparse as a
+//! rigid motion's.
 
 use super::graph::{Cloud, Graph, lengths, pack};
 use crate::simd::wide;

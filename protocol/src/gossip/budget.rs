@@ -4,8 +4,8 @@
 //!
 //! All that a robot sends comes out of one bucket, broadcasts once: questions do not say who asks, and on a radio all
 //! links share the air. So no link of the robot carries more than the rate and, after a pause, one burst
-//! ([`burst_bytes`]), but for the few bytes of "not now" to whoever asks beyond that; single announcements, questions and new facts may overdraw it and are paid back before anything
-//! follows them.
+//! ([`burst_bytes`]), but for the few bytes of "not now" to whoever asks beyond that; single announcements, questions
+//! and new facts may overdraw it and are paid back before anything follows them.
 
 use super::purse::Bucket;
 use crate::time::Instant;

@@ -2,6 +2,8 @@ use super::super::Described;
 use super::super::testing::{config, moved_room, room, room_points, submap};
 use super::*;
 use crate::submap::describe;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 fn settings() -> RegisterConfig {
     RegisterConfig { solver: SolverConfig { sigma_max: 0.15, ..Default::default() }, ..Default::default() }
@@ -68,6 +70,40 @@ fn submaps_without_shape_are_refused_and_settings_checked() {
     bad.solver.sigma_max = f64::NAN;
     let refused = register(&room(1).keypoints, &room(1).features, &bad);
     assert!(matches!(refused, Err(RegisterError::Solver(AlignError::BadConfig { field: "sigma_max", .. }))));
+}
+
+/// A hall furnished alike on both sides may be entered from either.
+#[test]
+fn a_room_that_is_its_own_half_turn_is_ambiguous() {
+    let twice = |seed: u64| {
+        let half = room_points(6);
+        let points: Vec<_> = half.iter().flat_map(|p| [*p, Vector3::new(-p.x, -p.y, p.z)]).collect();
+        // Both sides see other points of it.
+        let some = points.chunks(2).skip(seed as usize).step_by(2).flatten().copied();
+        describe(&submap(&some.collect::<Vec<_>>()), &config())
+    };
+    let refused = registered(&twice(0), &twice(1)).unwrap_err();
+    assert!(matches!(refused, RegisterError::Ambiguous { .. }), "{refused}");
+}
+
+/// A silo looks the same however one is turned in it.
+#[test]
+fn a_round_room_is_ambiguous() {
+    let silo = |seed: u64| {
+        let mut dice = ChaCha8Rng::seed_from_u64(seed);
+        let at = |_| {
+            let (angle, kind) = (dice.random_range(0.0..core::f64::consts::TAU), dice.random_range(0..3u8));
+            let (radius, z) = match kind {
+                0 => (1.5, dice.random_range(-1.0..1.5)),
+                1 => (1.5 * dice.random_range(0.0..1.0f64).sqrt(), -1.0),
+                _ => (1.5 * dice.random_range(0.0..1.0f64).sqrt(), 1.5),
+            };
+            Vector3::new(radius * libm::cos(angle), radius * libm::sin(angle), z)
+        };
+        describe(&submap(&(0..30_000).map(at).collect::<Vec<_>>()), &config())
+    };
+    let refused = registered(&silo(1), &silo(2)).unwrap_err();
+    assert!(matches!(refused, RegisterError::Ambiguous { .. }), "{refused}");
 }
 
 /// Clouds that were thinned differently show different things; a little difference does no harm.
