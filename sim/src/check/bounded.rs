@@ -2,7 +2,7 @@
 //! epochs of a robot than configured, no more batches wait for the disk than named, no table grows with what shouts, and
 //! the store's file stays within a bound.
 
-use super::{Check, RobotSample, Sample};
+use super::{Check, RobotSample, Sample, Seen};
 use merganser_protocol::config::GossipConfig;
 use merganser_protocol::ids::RobotId;
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,8 +17,8 @@ const DISK_BYTES_MAX: u64 = 64 << 20;
 /// See the module.
 #[derive(Debug, Default)]
 pub struct Bounded {
-    /// Ids of all members that ever ran, as snapshots print them.
-    members: BTreeSet<String>,
+    /// Members that ever ran.
+    members: BTreeSet<RobotId>,
 }
 
 impl Check for Bounded {
@@ -26,8 +26,14 @@ impl Check for Bounded {
         "bounded"
     }
 
+    fn see(&mut self, _: usize, seen: &Seen<'_>) -> Result<(), String> {
+        if let Seen::Started(robot) = seen {
+            self.members.insert(*robot);
+        }
+        Ok(())
+    }
+
     fn sample(&mut self, sample: &Sample<'_>) -> Result<(), String> {
-        self.members.extend(sample.robots.iter().filter_map(|robot| Some(robot.snapshot.as_ref()?.status.id.clone())));
         sample.robots.iter().try_for_each(|robot| self.check(robot).map_err(|why| format!("{}: {why}", robot.name)))
     }
 }
@@ -44,7 +50,7 @@ impl Bounded {
             return Err(format!("its store has {} bytes", robot.disk_bytes));
         }
         let Some(snapshot) = &robot.snapshot else { return Ok(()) };
-        if let Some(stranger) = epochs.keys().find(|origin| !self.members.contains(&origin.to_string())) {
+        if let Some(stranger) = epochs.keys().find(|origin| !self.members.contains(origin)) {
             return Err(format!("it holds a log of {stranger}, whom no roster has"));
         }
         let unsaved = snapshot.status.unsaved;
@@ -69,10 +75,11 @@ mod tests {
     fn verdict(spoil: impl Fn(&mut RobotSample)) -> Result<(), String> {
         let id = RobotId([1; 8]);
         let mut one = robot("alpha", 1, &[]);
-        one.snapshot.as_mut().unwrap().status.id = id.to_string();
         one.logs.insert(FrameId { robot: id, epoch: 0 }, Some(3));
         spoil(&mut one);
-        Bounded::default().sample(&sample(vec![one], &BTreeMap::new(), &Expect::default()))
+        let mut check = Bounded::default();
+        check.see(0, &Seen::Started(id))?;
+        check.sample(&sample(vec![one], &BTreeMap::new(), &Expect::default()))
     }
 
     #[test]
