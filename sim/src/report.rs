@@ -78,6 +78,7 @@ impl Report {
     /// The report of a run.
     pub fn of<C>(outcome: &Outcome<C>) -> Self {
         let sample = Sample {
+            at: outcome.ended,
             phase: Phase::End,
             robots: outcome.robots.clone(),
             truth: &outcome.truth,

@@ -1,13 +1,20 @@
 //! When faults stop, all converge in the stated time (DESIGN §8.6): at the end of a run every robot that is running
 //! holds the same digest. A swarm that is still at work then writes on, and its last facts may be on their way: what any
-//! robot held [`LAG`] samples before, all must hold, and equal logs must have equal digests.
+//! robot held a stated time before, all must hold, and equal logs must have equal digests.
 
 use super::{Check, Phase, RobotSample, Sample};
+use core::time::Duration;
 use merganser_protocol::ids::FrameId;
+use merganser_protocol::time::Instant;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-/// Samples (at least a second apart) that a fact may take to reach everyone.
-const LAG: usize = 10;
+/// What a fact may take to reach everyone: so long among few...
+const LAG_SECS: f64 = 10.0;
+/// ...so much more for each of them beyond five, for what they all write goes over the same links...
+const LAG_SECS_PER_ROBOT: f64 = 2.0;
+/// ...but no more than this, or than this for each row of a crowd.
+const LAG_SECS_MAX: f64 = 20.0;
+const LAG_SECS_PER_ROW: f64 = 3.0;
 
 /// Lengths of logs; `None` for those with two histories.
 type Logs = BTreeMap<FrameId, Option<u32>>;
@@ -15,8 +22,8 @@ type Logs = BTreeMap<FrameId, Option<u32>>;
 /// See the module. The stated time is the scenario's `settle_secs`.
 #[derive(Debug, Default)]
 pub struct Converged {
-    /// What anybody held since the healing, the latest last.
-    held: VecDeque<Logs>,
+    /// What anybody held since the healing, and when: all of the last while, and the latest of what came before.
+    held: VecDeque<(Instant, Logs)>,
 }
 
 impl Check for Converged {
@@ -26,17 +33,20 @@ impl Check for Converged {
 
     fn sample(&mut self, sample: &Sample<'_>) -> Result<(), String> {
         let robots = &sample.robots;
+        let is_old = |at: Instant| at.after(lag(robots.len())) <= sample.at;
         if sample.phase == Phase::Calm {
-            self.held.push_back(all_logs(robots));
-            self.held.drain(..self.held.len().saturating_sub(LAG));
+            self.held.push_back((sample.at, all_logs(robots)));
+            while self.held.get(1).is_some_and(|(at, _)| is_old(*at)) {
+                self.held.pop_front();
+            }
         }
         let digests: BTreeSet<_> = robots.iter().map(|robot| robot.digest).collect();
         if sample.phase != Phase::End || digests.len() <= 1 {
             return Ok(());
         }
         let logs: BTreeSet<&Logs> = robots.iter().map(|robot| &robot.logs).collect();
-        let old = self.held.front().filter(|_| self.held.len() == LAG);
-        if logs.len() == digests.len() && old.is_some_and(|old| robots.iter().all(|robot| holds(&robot.logs, old))) {
+        let old = self.held.iter().rev().find(|(at, _)| is_old(*at));
+        if logs.len() == digests.len() && old.is_some_and(|(_, old)| robots.iter().all(|robot| holds(&robot.logs, old))) {
             return Ok(());
         }
         let of = |robot: &RobotSample| {
@@ -47,6 +57,12 @@ impl Check for Converged {
         let all: Vec<String> = robots.iter().map(of).collect();
         Err(format!("{} different sets: {}", digests.len(), all.join(", ")))
     }
+}
+
+fn lag(robots: usize) -> Duration {
+    let n = robots as f64;
+    let few = (LAG_SECS + LAG_SECS_PER_ROBOT * (n - 5.0)).clamp(LAG_SECS, LAG_SECS_MAX);
+    Duration::from_secs_f64(few.max(LAG_SECS_PER_ROW * libm::sqrt(n)))
 }
 
 fn all_logs(robots: &[RobotSample]) -> Logs {
@@ -86,8 +102,8 @@ mod tests {
         assert!(Converged::default().sample(&end).is_ok());
     }
 
-    /// Whether it bites when alpha held so much of a log for so many samples, more at the end, and beta this.
-    fn bites(before: Option<u32>, samples: usize, beta: Option<u32>) -> bool {
+    /// Whether it bites when alpha held so much of a log for so many seconds, more at the end, and beta this.
+    fn bites(before: Option<u32>, secs: u64, beta: Option<u32>) -> bool {
         let (truth, expect) = (BTreeMap::new(), Expect::default());
         let two = |alpha: Option<u32>, beta: Option<u32>| {
             let mut robots = vec![robot("alpha", 1, &[]), robot("beta", 2, &[])];
@@ -96,19 +112,26 @@ mod tests {
             robots
         };
         let mut check = Converged::default();
-        for _ in 0..samples {
+        let at = |secs: u64| Instant::ZERO.after(Duration::from_secs(secs));
+        for now in 0..secs {
             let calm = sample(two(before, Some(0)), &truth, &expect);
-            check.sample(&Sample { phase: Phase::Calm, ..calm }).unwrap();
+            check.sample(&Sample { at: at(now), phase: Phase::Calm, ..calm }).unwrap();
         }
-        check.sample(&sample(two(Some(9), beta), &truth, &expect)).is_err()
+        check.sample(&Sample { at: at(secs), ..sample(two(Some(9), beta), &truth, &expect) }).is_err()
     }
 
     #[test]
     fn the_last_facts_of_a_swarm_at_work_may_be_on_their_way_and_no_others() {
-        assert!(!bites(Some(7), LAG, Some(7)));
-        assert!(bites(Some(7), LAG, Some(6)), "it was there long enough");
-        assert!(bites(Some(7), LAG - 1, Some(7)), "nobody knows how long it was there");
-        assert!(bites(Some(7), LAG, Some(9)), "equal logs, different digests");
-        assert!(bites(None, LAG, Some(9)) && bites(None, LAG, Some(8)), "a quarantine reaches all");
+        let lag = lag(2).as_secs();
+        assert!(!bites(Some(7), lag, Some(7)));
+        assert!(bites(Some(7), lag, Some(6)), "it was there long enough");
+        assert!(bites(Some(7), lag - 1, Some(7)), "nobody knows how long it was there");
+        assert!(bites(Some(7), lag, Some(9)), "equal logs, different digests");
+        assert!(bites(None, lag, Some(9)) && bites(None, lag, Some(8)), "a quarantine reaches all");
+    }
+
+    #[test]
+    fn facts_may_take_longer_where_there_are_more_robots() {
+        assert_eq!([2, 5, 8, 10, 100, 1000].map(|n| lag(n).as_secs()), [10, 10, 16, 20, 30, 94]);
     }
 }

@@ -87,6 +87,8 @@ pub enum Phase {
 #[derive(Clone, Debug)]
 pub struct Sample<'a> {
     /// When.
+    pub at: Instant,
+    /// In which phase.
     pub phase: Phase,
     /// Every robot that is running.
     pub robots: Vec<RobotSample>,
@@ -230,6 +232,6 @@ pub(crate) mod tests {
 
     /// A last sample of these robots.
     pub fn sample<'a>(robots: Vec<RobotSample>, truth: &'a BTreeMap<String, Se3>, expect: &'a Expect) -> Sample<'a> {
-        Sample { phase: Phase::End, robots, truth, expect }
+        Sample { at: Instant::ZERO, phase: Phase::End, robots, truth, expect }
     }
 }

@@ -56,7 +56,7 @@ impl<C: Core> Swarm<C> {
         let done = self.healed && all_done(&robots);
         self.done_samples = if done { self.done_samples + 1 } else { 0 };
         let phase = if self.healed { Phase::Calm } else { Phase::Storm };
-        let sample = Sample { phase, robots, truth: &self.truth, expect: &self.scenario.expect };
+        let sample = Sample { at: now, phase, robots, truth: &self.truth, expect: &self.scenario.expect };
         let (checks, stopwatch) = (&mut self.checks, &mut self.stopwatch);
         if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {
             self.violation.get_or_insert(violation);

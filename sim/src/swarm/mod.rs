@@ -246,7 +246,7 @@ impl<C: Core> Swarm<C> {
         self.counts.held_back = snapshots.flat_map(|snapshot| snapshot.stats.held_back.values()).sum();
         if self.violation.is_none() {
             let sample =
-                Sample { phase: Phase::End, robots: robots.clone(), truth: &self.truth, expect: &self.scenario.expect };
+                Sample { at: ended, phase: Phase::End, robots: robots.clone(), truth: &self.truth, expect: &self.scenario.expect };
             self.violation = self.checks.sample(ended, &sample);
         }
         Outcome {
