@@ -45,8 +45,8 @@ impl Check for Converged {
             return Ok(());
         }
         let logs: BTreeSet<&Logs> = robots.iter().map(|robot| &robot.logs).collect();
-        let old = self.held.iter().rev().find(|(at, _)| is_old(*at));
-        if logs.len() == digests.len() && old.is_some_and(|(_, old)| robots.iter().all(|robot| holds(&robot.logs, old))) {
+        let old = self.held.iter().rev().find(|(at, _)| is_old(*at)).map(|(_, logs)| logs);
+        if logs.len() == digests.len() && old.is_some_and(|old| robots.iter().all(|robot| holds(&robot.logs, old))) {
             return Ok(());
         }
         let of = |robot: &RobotSample| {

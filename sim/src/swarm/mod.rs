@@ -245,8 +245,13 @@ impl<C: Core> Swarm<C> {
         let snapshots = robots.iter().filter_map(|robot| robot.snapshot.as_ref());
         self.counts.held_back = snapshots.flat_map(|snapshot| snapshot.stats.held_back.values()).sum();
         if self.violation.is_none() {
-            let sample =
-                Sample { at: ended, phase: Phase::End, robots: robots.clone(), truth: &self.truth, expect: &self.scenario.expect };
+            let sample = Sample {
+                at: ended,
+                phase: Phase::End,
+                robots: robots.clone(),
+                truth: &self.truth,
+                expect: &self.scenario.expect,
+            };
             self.violation = self.checks.sample(ended, &sample);
         }
         Outcome {
