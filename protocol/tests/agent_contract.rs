@@ -6,7 +6,7 @@ mod common;
 use common::{Wires, World, agent, drive, name, robot};
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Output, QueryKind, Record};
 use merganser_protocol::agent::{Agent, Restored};
-use merganser_protocol::ids::{FrameId, Name, RobotId};
+use merganser_protocol::ids::{FrameId, Hash, Name, RobotId};
 use merganser_protocol::replica::Replica;
 use merganser_protocol::time::Instant;
 use merganser_protocol::wire::EntryBytes;
@@ -58,11 +58,26 @@ fn nothing_is_published_before_it_is_durable() {
     }
     assert!(held_back.len() >= 2);
     assert_eq!(agent.status().entries, 0, "not durable, not held");
+    // A twin on a copy of this robot's disk may have told others of the very same keypoints.
+    let blobs = held_back.iter().flat_map(|(_, records)| records).filter_map(|record| match record {
+        Record::Blob { hash, .. } => Some(*hash),
+        _ => None,
+    });
+    let blobs: Vec<Hash> = blobs.collect();
+    assert!(!blobs.is_empty() && !blobs.iter().any(|blob| gives(&mut agent, *blob)));
     let (last, _) = held_back[held_back.len() - 1];
     agent.handle(Instant::ZERO, Input::Persisted { up_to: last });
     let published = drain(&mut agent);
     assert!(published.iter().any(|o| matches!(o, Output::Publish { channel: Channel::Facts, .. })));
     assert_eq!(agent.status().entries, held_back.len() as u64);
+    assert!(blobs.iter().all(|blob| gives(&mut agent, *blob)));
+}
+
+/// Whether the agent answers a question for this blob with a piece of it.
+fn gives(agent: &mut Agent, hash: Hash) -> bool {
+    let bytes = Message::BlobRequest { hash, offset: 0, len: 64 }.encode();
+    agent.handle(Instant::ZERO, Input::Asked { token: AskToken(1), kind: QueryKind::Blob, bytes });
+    drain(agent).iter().any(|output| matches!(output, Output::Answer { bytes, .. } if !bytes.is_empty()))
 }
 
 #[test]

@@ -89,8 +89,8 @@ impl Agent {
         let blob = described.keypoints.encode();
         let hash = Hash::of(&blob);
         self.ledger.open.push(Record::Private { submap: id, bytes: described.features.encode() });
-        self.ledger.open.push(Record::Blob { hash, bytes: blob.clone() });
-        self.keep_blob(blob);
+        self.keep_keypoints(hash, &blob);
+        self.ledger.open.push(Record::Blob { hash, bytes: blob });
         self.event(Event::SubmapFinished { submap: id, keypoints: described.keypoints.len() });
         self.negotiation.add_features(id, Arc::new(described.features));
         // The epoch may have ended meanwhile: the submap still belongs to the frame it was driven in.
@@ -127,16 +127,26 @@ impl Agent {
         }
     }
 
-    /// Keeps a keypoint blob and its decoded form.
+    /// Keeps a keypoint blob, for whoever asks, and its decoded form.
     pub(super) fn keep_blob(&mut self, bytes: Vec<u8>) {
         let hash = Hash::of(&bytes);
-        match Keypoints::decode(&bytes) {
+        if self.keep_keypoints(hash, &bytes) {
+            self.gossip.add_blob(hash, bytes);
+        }
+    }
+
+    /// Keeps what a keypoint blob says. False if it says nothing.
+    fn keep_keypoints(&mut self, hash: Hash, blob: &[u8]) -> bool {
+        match Keypoints::decode(blob) {
             Ok(keypoints) => {
                 self.negotiation.out_of_reach.remove(&hash);
                 self.negotiation.add_keypoints(hash, Arc::new(keypoints));
-                self.gossip.add_blob(hash, bytes);
+                true
             }
-            Err(error) => self.reject(None, "blob", &error.to_string()),
+            Err(error) => {
+                self.reject(None, "blob", &error.to_string());
+                false
+            }
         }
     }
 

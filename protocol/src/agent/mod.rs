@@ -128,7 +128,15 @@ struct Me {
 struct Ledger {
     open: Vec<Record>,
     last_batch: u64,
-    waiting: BTreeMap<u64, Vec<EntryId>>,
+    waiting: BTreeMap<u64, Batch>,
+}
+
+/// What takes effect once it is durable.
+#[derive(Default)]
+struct Batch {
+    entries: Vec<EntryId>,
+    /// Keypoints of our own. A twin with our key may have told others of them: they wait for our disk all the same.
+    blobs: Vec<(Hash, Vec<u8>)>,
 }
 
 impl Agent {
@@ -366,11 +374,15 @@ impl Agent {
         }
         let records = core::mem::take(&mut self.ledger.open);
         self.ledger.last_batch += 1;
-        let entries = records.iter().filter_map(|record| match record {
-            Record::Entry { id, .. } => Some(*id),
-            _ => None,
-        });
-        self.ledger.waiting.insert(self.ledger.last_batch, entries.collect());
+        let mut batch = Batch::default();
+        for record in &records {
+            match record {
+                Record::Entry { id, .. } => batch.entries.push(*id),
+                Record::Blob { hash, bytes } => batch.blobs.push((*hash, bytes.clone())),
+                _ => {}
+            }
+        }
+        self.ledger.waiting.insert(self.ledger.last_batch, batch);
         self.outputs.push_back(Output::Persist { batch: self.ledger.last_batch, records });
     }
 
@@ -382,9 +394,13 @@ impl Agent {
             self.event(Event::StoreHealed);
         }
         let mut own = Vec::new();
-        let durable: Vec<EntryId> = durable.into_values().flatten().collect();
-        self.gossip.spread.on_news(self.now, durable.len());
-        for id in durable {
+        let mut entries = Vec::new();
+        for batch in durable.into_values() {
+            entries.extend(batch.entries);
+            batch.blobs.into_iter().for_each(|(hash, bytes)| self.gossip.add_blob(hash, bytes));
+        }
+        self.gossip.spread.on_news(self.now, entries.len());
+        for id in entries {
             self.replica.mark_durable(id);
             self.learn(id);
             if id.frame.robot == self.me.robot {
