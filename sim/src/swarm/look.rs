@@ -4,7 +4,7 @@ use super::robot::Robot;
 use super::{Event, Swarm, all_agree, all_done};
 use crate::check::{Phase, RobotSample, Sample, Seen};
 use crate::core::Core;
-use crate::field::TICK;
+use crate::field::{Layout, TICK};
 use crate::network::millis;
 use merganser_protocol::snapshot::SubmapView;
 use merganser_protocol::time::Instant;
@@ -41,11 +41,16 @@ impl<C: Core> Swarm<C> {
     /// Robots drive on, and radios reach others.
     pub(super) fn move_on(&mut self, now: Instant) {
         self.field.drive(now.as_secs_f64(), TICK);
-        let place: Vec<usize> = (0..self.robots.len()).map(|robot| self.drives(robot)).collect();
-        self.network.set_reach(self.field.reach(&place));
+        self.reach();
         self.update_hearing(now);
-        if self.field.moves() {
-            self.queue.push(now.after(millis(1e3 * TICK)), Event::Move);
+        self.queue.push(now.after(millis(1e3 * TICK)), Event::Move);
+    }
+
+    /// Tells the network who is in reach of whom. Where all are, it knows.
+    pub(super) fn reach(&mut self) {
+        if self.scenario.radio != Layout::Mesh {
+            let place: Vec<usize> = (0..self.robots.len()).map(|robot| self.drives(robot)).collect();
+            self.network.set_reach(self.field.reach(&place));
         }
     }
 

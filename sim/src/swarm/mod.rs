@@ -21,7 +21,7 @@ use crate::check::{Checks, Phase, RobotSample, Sample, Violation};
 use crate::core::Core;
 use crate::dice::Dice;
 use crate::faults::FaultCounts;
-use crate::field::{Field, Layout};
+use crate::field::Field;
 use crate::network::{Network, millis};
 use crate::queue::Queue;
 use crate::scenario::Scenario;
@@ -179,11 +179,12 @@ impl<C: Core> Swarm<C> {
         }
         queue.push(secs(scenario.duration_secs + scenario.machine.start_within_secs), Event::Heal);
         queue.push(secs(1.0), Event::Sample);
-        if scenario.radio != Layout::Mesh {
+        let field = Field::new(scenario.radio, members, seed);
+        if field.moves() {
             queue.push(Instant::ZERO, Event::Move);
         }
-        Ok(Self {
-            field: Field::new(scenario.radio, members, seed),
+        let mut swarm = Self {
+            field,
             network: Network::new(scenario.network.clone(), robots.len(), seed),
             ids: robots.iter().take(members).enumerate().map(|(index, robot)| (robot.id, index)).collect(),
             standin: scenario.summary.clone().map(|options| StandIn::new(options, seed)),
@@ -204,7 +205,9 @@ impl<C: Core> Swarm<C> {
             agreed_since: None,
             events: 0,
             second: (0, 0),
-        })
+        };
+        swarm.reach();
+        Ok(swarm)
     }
 
     /// Runs to the end: until an invariant breaks, all is calm and done, or the time to settle is over. `progress` is

@@ -16,6 +16,7 @@ pub use case::Case;
 pub use run::{Outcome, Shared, measure, share};
 
 use crate::bar::progress_bar;
+use crate::field::Layout;
 use clap::Args;
 use policy::Policy;
 use std::io::Write;
@@ -32,6 +33,9 @@ pub struct Gossip {
     /// Messages lost, in per cent; each case has its usual loss
     #[arg(long, value_parser = clap::value_parser!(u8).range(0..=90))]
     loss: Option<u8>,
+    /// Speed of robots that drive about, m/s; the slower, the longer no gossip can be done
+    #[arg(long, value_name = "M/S", value_parser = clap::value_parser!(u8).range(1..=100))]
+    speed: Option<u8>,
     /// Worlds
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     seeds: u64,
@@ -58,6 +62,9 @@ pub fn run(options: &Gossip) -> anyhow::Result<bool> {
         let mut world = case.world();
         world.robots = options.robots.map_or(world.robots, usize::from);
         world.loss = options.loss.map_or(world.loss, |percent| f64::from(percent) / 100.0);
+        if let (Some(speed), Layout::Waypoints { speed_m_s, .. }) = (options.speed, &mut world.layout) {
+            *speed_m_s = f64::from(speed);
+        }
         for seed in options.first..options.first + options.seeds {
             if let Some(bound) = bound::bound(&world, seed) {
                 bar.suspend(|| writeln!(out, "{bound}"))?;
