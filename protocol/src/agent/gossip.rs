@@ -48,6 +48,7 @@ pub(super) struct SeenBeacon {
 struct Question {
     peer: RobotId,
     about: About,
+    asked: Instant,
     expires: Instant,
 }
 
@@ -165,7 +166,7 @@ impl Agent {
         let query = self.new_query();
         let bytes = self.pay_for(message);
         let expires = self.now.after(Duration::from_secs_f64(3.0 * self.config.gossip.answer_secs));
-        self.gossip.questions.insert(query, Question { peer, about, expires });
+        self.gossip.questions.insert(query, Question { peer, about, asked: self.now, expires });
         self.outputs.push_back(Output::Ask { query, peer, kind, bytes });
         query
     }
@@ -268,9 +269,9 @@ impl Agent {
                 let nothing = delta.entries.is_empty() && delta.forks.is_empty();
                 let postponed = delta.more && nothing;
                 let answer = if postponed { Answer::Postponed } else { Answer::Got { new, more: delta.more } };
-                self.synced(question.peer, answer);
+                self.synced(&question, answer);
             }
-            (About::Sync, _) => self.synced(question.peer, if refused { Answer::Refused } else { Answer::Failed }),
+            (About::Sync, _) => self.synced(&question, if refused { Answer::Refused } else { Answer::Failed }),
             (About::Blob(hash), Some(Message::BlobReply { hash: named, offset, total, bytes })) if named == hash => {
                 self.on_piece(query, question.peer, hash, (offset, total), &bytes);
             }
@@ -279,8 +280,8 @@ impl Agent {
         }
     }
 
-    fn synced(&mut self, peer: RobotId, answer: Answer) {
-        self.gossip.spread.on_answer(self.now, &self.replica, peer, answer);
+    fn synced(&mut self, question: &Question, answer: Answer) {
+        self.gossip.spread.on_answer(self.now, &self.replica, question.peer, question.asked, answer);
     }
 
     /// A piece of a blob came. Pieces may come from different robots; the hash of the whole decides.

@@ -6,6 +6,9 @@
 //! - **Pull**: a neighbour with another root is asked for what we lack, by have-vector; one question at a time, to the
 //!   neighbour that promises most, so that nothing is fetched twice. Small gains wait for more, large ones do not, nor
 //!   what follows a large one: after a partition the last few facts are as welcome as the first many.
+//!   A question that is overdue keeps nobody back: others are asked, then the same neighbour again, and what the lost
+//!   one cost is given back. How long is overdue, answers tell (RFC 6298), and what is at stake: nobody waits long for
+//!   little.
 //! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
 //! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
 //!   pause that doubles until either side changes.
@@ -45,7 +48,7 @@ const FAR_APART: usize = 48;
 pub enum Step {
     /// Broadcast this.
     Announce(HaveRoot),
-    /// Ask this neighbour what we lack; report with [`Spread::on_answer`].
+    /// Ask this neighbour what we lack; report with [`Spread::on_answer`], and when this was.
     Ask {
         /// Whom.
         peer: RobotId,
@@ -149,11 +152,11 @@ impl Spread {
         }
     }
 
-    /// A question was answered, or failed; what came was taken in.
-    pub fn on_answer(&mut self, now: Instant, replica: &Replica, peer: RobotId, answer: Answer) {
+    /// A question asked at `asked` was answered, or failed; what came was taken in.
+    pub fn on_answer(&mut self, now: Instant, replica: &Replica, peer: RobotId, asked: Instant, answer: Answer) {
         let Some(neighbour) = self.neighbours.get_mut(&peer) else { return };
         self.wake = now;
-        neighbour.answered(now, replica.root(), answer);
+        neighbour.answered(now, replica.root(), asked, answer);
         if matches!(answer, Answer::Got { new, .. } if new >= FAR_APART) {
             self.purse.refill(now);
             self.announce.refill(now);
@@ -194,6 +197,9 @@ impl Spread {
         let strangers = self.neighbours.values().filter(|neighbour| neighbour.is_stranger()).count();
         let mut best: Vec<(RobotId, f64)> = Vec::new();
         for (robot, neighbour) in &mut self.neighbours {
+            if let Some(gain) = neighbour.lost() {
+                self.purse.give_back(now, gain);
+            }
             match neighbour.promises(now, replica, (root, count), self.me < *robot, strangers) {
                 Ok(gain) => best.push((*robot, gain)),
                 Err(again) => self.wake = self.wake.min(again),
@@ -213,7 +219,7 @@ impl Spread {
         let neighbour = self.neighbours.get_mut(&peer)?;
         self.purse.pay(now, most, 1.0);
         self.wake = now;
-        let have = neighbour.question(now, self.me, replica);
+        let have = neighbour.question(now, self.me, replica, most);
         Some(Step::Ask { peer, have })
     }
 }

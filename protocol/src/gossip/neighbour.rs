@@ -23,8 +23,16 @@ const LATER_MIN: Duration = Duration::from_millis(500);
 const LATER_MAX: Duration = Duration::from_secs(4);
 /// Round trip assumed before the first answer.
 const ROUND_TRIP: Duration = Duration::from_millis(100);
-/// Shortest patience with a question.
-const PATIENCE_MIN: Duration = Duration::from_millis(200);
+/// A neighbour that has not answered in time may be asked again, with so much less hope: others come first.
+const HOPE: f64 = 0.4;
+/// From so many unanswered questions in a row on, each doubles the patience with the next...
+const GIVEN_UP_FREE: u32 = 3;
+/// ...so many times at most.
+const GIVEN_UP_MAX: u32 = 4;
+/// Shortest patience with a question: less, and answers that were only queued are fetched twice.
+const PATIENCE_MIN: Duration = Duration::from_millis(300);
+/// Who waits for little loses little if it is fetched twice.
+const PATIENCE_PER_FACT: Duration = Duration::from_millis(10);
 
 /// One neighbour.
 #[derive(Clone, Debug)]
@@ -43,7 +51,11 @@ pub(super) struct Neighbour {
     compared: u64,
     /// Its last answer was cut to its budget.
     more: bool,
+    /// Smoothed time that answers take, and how much that varies (RFC 6298).
     round_trip: Duration,
+    varies: Duration,
+    /// Questions in a row that were given up.
+    given_up: u32,
     rest: Option<Rest>,
     /// It had no room on its link: not asked before, and the pause that this was.
     later: Option<(Instant, Duration)>,
@@ -54,6 +66,10 @@ pub(super) struct Neighbour {
 struct Question {
     at: Instant,
     named: bool,
+    /// Facts that it may bring.
+    gain: f64,
+    /// Whether it was already taken for lost.
+    lost: bool,
     /// Where its vector began.
     window: Option<FrameId>,
 }
@@ -79,6 +95,8 @@ impl Default for Neighbour {
             compared: 0,
             more: false,
             round_trip: ROUND_TRIP,
+            varies: ROUND_TRIP,
+            given_up: 0,
             rest: None,
             later: None,
         }
@@ -97,11 +115,24 @@ impl Neighbour {
 
     /// Until when a question under way keeps others back; `None` if there is none, or it is overdue.
     pub fn patience_ends(&self, now: Instant, longest: Duration) -> Option<Instant> {
-        let patience = (3 * self.round_trip).clamp(PATIENCE_MIN, longest.max(PATIENCE_MIN));
-        self.asked.map(|question| question.at.after(patience)).filter(|ends| now < *ends)
+        let usual = (self.round_trip + 4 * self.varies).max(PATIENCE_MIN);
+        let backoff = 1 << self.given_up.saturating_sub(GIVEN_UP_FREE).min(GIVEN_UP_MAX);
+        let question = self.asked?;
+        let worth = PATIENCE_MIN + PATIENCE_PER_FACT.mul_f64(question.gain.min(1e6));
+        let patience = usual.min(worth).saturating_mul(backoff).min(longest.max(PATIENCE_MIN));
+        Some(question.at.after(patience)).filter(|ends| now < *ends)
     }
 
-    /// How many facts a question may bring; or when to think about it again. Our root and count; `first`: where both may
+    /// Called when no question keeps others back: what one that is overdue was hoped to bring, once.
+    pub fn lost(&mut self) -> Option<f64> {
+        let question = self.asked.as_mut().filter(|question| !question.lost)?;
+        question.lost = true;
+        self.more = false; // Somebody else may do better.
+        Some(question.gain)
+    }
+
+    /// How many facts a question may bring; or when to think about it again. Called when no question keeps others back:
+    /// one that is under way is overdue. Our root and count; `first`: where both may
     /// ask, it is we who do; `strangers`: neighbours we never compared with.
     pub fn promises(
         &mut self,
@@ -111,9 +142,18 @@ impl Neighbour {
         first: bool,
         strangers: usize,
     ) -> Result<f64, Instant> {
-        if self.asked.is_some() {
-            return Err(Instant::MAX); // Its answer, or its failure, wakes us.
-        }
+        let hope = if self.asked.is_some() { HOPE } else { 1.0 };
+        self.may_bring(now, replica, (root, count), first, strangers).map(|gain| hope * gain)
+    }
+
+    fn may_bring(
+        &mut self,
+        now: Instant,
+        replica: &Replica,
+        (root, count): ([u8; 8], u64),
+        first: bool,
+        strangers: usize,
+    ) -> Result<f64, Instant> {
         if let Some((until, _)) = self.later.filter(|(until, _)| now < *until) {
             return Err(until);
         }
@@ -150,10 +190,13 @@ impl Neighbour {
         Ok((have.count.saturating_sub(self.compared) as f64 * NEW_TO_US).max(1.0))
     }
 
-    /// The vector to ask it with: of the logs it is known to have more of, else of all.
-    pub fn question(&mut self, now: Instant, me: RobotId, replica: &Replica) -> HaveVector {
+    /// The vector to ask it with: of the logs it is known to have more of, else of all. `gain`: what it may bring.
+    pub fn question(&mut self, now: Instant, me: RobotId, replica: &Replica, gain: f64) -> HaveVector {
         let named = self.named(replica);
-        self.asked = Some(Question { at: now, named: !named.is_empty(), window: self.window });
+        if self.asked.is_some() {
+            self.given_up = self.given_up.saturating_add(1);
+        }
+        self.asked = Some(Question { at: now, named: !named.is_empty(), gain, lost: false, window: self.window });
         if !named.is_empty() {
             return replica.have_named(me, self.listed, named);
         }
@@ -163,9 +206,17 @@ impl Neighbour {
         have
     }
 
-    /// The question under way was answered or failed; `root` is ours now.
-    pub fn answered(&mut self, now: Instant, root: [u8; 8], answer: Answer) {
-        let Some(question) = self.asked.take() else { return };
+    /// A question of ours, asked at `asked`, was answered or failed; `root` is ours now.
+    pub fn answered(&mut self, now: Instant, root: [u8; 8], asked: Instant, answer: Answer) {
+        if answer != Answer::Failed {
+            self.given_up = 0;
+        }
+        let Some(question) = self.asked.take_if(|question| question.at == asked) else {
+            if matches!(answer, Answer::Got { .. }) {
+                self.took(now.since(asked)); // Given up too early: have more patience.
+            }
+            return;
+        };
         let (new, more) = match answer {
             Answer::Failed => {
                 self.more = false; // Somebody else may do better. How long answers take, those that come tell.
@@ -185,7 +236,7 @@ impl Neighbour {
             Answer::Got { new, more } => (new, more),
         };
         self.later = None;
-        self.round_trip = (3 * self.round_trip + now.since(question.at)) / 4;
+        self.took(now.since(question.at));
         self.more = more && new > 0;
         if self.more {
             return;
@@ -200,6 +251,11 @@ impl Neighbour {
             let tagged = core::mem::replace(&mut self.tagged, new == 0);
             self.rest(now, root, new == 0 && tagged);
         }
+    }
+
+    fn took(&mut self, time: Duration) {
+        self.varies = (3 * self.varies + time.abs_diff(self.round_trip)) / 4;
+        self.round_trip = (7 * self.round_trip + time) / 8;
     }
 
     /// Logs worth asking for by name.
@@ -228,21 +284,73 @@ mod tests {
     use crate::wire::samples;
 
     #[test]
+    fn patience_follows_the_answers_late_ones_too() {
+        let (replica, me) = (replica(), samples::robot(0));
+        let mut one = Neighbour::default();
+        let longest = Duration::from_secs(10);
+        let patience = |one: &mut Neighbour, now: Instant, gain: f64| {
+            one.question(now, me, &replica, gain);
+            one.patience_ends(now, longest).unwrap().since(now)
+        };
+        let mut now = Instant::ZERO;
+        for _ in 0..50 {
+            patience(&mut one, now, 1e3);
+            one.answered(now.after(Duration::from_millis(50)), [0; 8], now, Answer::Got { new: 1, more: true });
+            now = now.after(Duration::from_secs(1));
+        }
+        assert_eq!(patience(&mut one, now, 1e3), PATIENCE_MIN, "answers come fast");
+        // The link becomes slow: each answer comes after the question was given up, and another was asked.
+        let slow = Duration::from_secs(2);
+        for _ in 0..50 {
+            let asked = now;
+            now = now.after(Duration::from_secs(3));
+            patience(&mut one, now, 1e3);
+            one.answered(asked.after(slow), [0; 8], asked, Answer::Got { new: 1, more: true });
+        }
+        let patient = patience(&mut one, now, 1e3);
+        assert!(patient >= slow && patient < 2 * slow, "{patient:?}");
+        assert!(patience(&mut one, now, 2.0) < 2 * PATIENCE_MIN, "nobody waits long for little");
+    }
+
+    #[test]
+    fn who_never_answers_is_asked_ever_more_rarely() {
+        let (replica, me) = (replica(), samples::robot(0));
+        let ours = (replica.root(), replica.count());
+        let mut one = Neighbour::default();
+        one.heard(Instant::ZERO, HaveRoot { root: [1; 8], count: 5_000 });
+        let longest = Duration::from_secs(6);
+        let mut now = Instant::ZERO;
+        let mut pauses = Vec::new();
+        for _ in 0..9 {
+            let hope = one.promises(now, &replica, ours, true, 1).unwrap();
+            one.question(now, me, &replica, hope);
+            let ends = one.patience_ends(now, longest).unwrap();
+            assert_eq!(one.patience_ends(ends, longest), None);
+            assert!(one.lost().is_some() && one.lost().is_none(), "given back once");
+            assert!(one.promises(ends, &replica, ours, true, 1).unwrap() < 0.5 * STRANGERS, "others come first");
+            pauses.push(ends.since(now));
+            now = ends;
+        }
+        assert!(pauses.is_sorted() && pauses[3] == pauses[0], "{pauses:?}");
+        assert_eq!(pauses[8], longest);
+    }
+
+    #[test]
     fn who_has_no_room_is_asked_the_same_again_after_a_pause() {
         let (replica, me) = (replica(), samples::robot(0));
         let ours = (replica.root(), replica.count());
         let mut one = Neighbour::default();
         one.heard(Instant::ZERO, HaveRoot { root: [1; 8], count: 50 });
-        one.question(Instant::ZERO, me, &replica);
-        one.answered(Instant::ZERO, ours.0, Answer::Got { new: 5, more: true });
+        one.question(Instant::ZERO, me, &replica, 1.0);
+        one.answered(Instant::ZERO, ours.0, Instant::ZERO, Answer::Got { new: 5, more: true });
         one.window = Some(samples::frame(0, 1));
         let mut now = Instant::ZERO;
         let mut pause = LATER_MIN;
         for _ in 0..8 {
             assert_eq!(one.promises(now, &replica, ours, true, 1), Ok(f64::from(u32::MAX)), "a tail to resume");
             let before = one.window;
-            one.question(now, me, &replica);
-            one.answered(now, ours.0, Answer::Postponed);
+            one.question(now, me, &replica, 1.0);
+            one.answered(now, ours.0, now, Answer::Postponed);
             assert_eq!(one.window, before);
             let again = now.after(pause);
             let soon = now.after(pause - Duration::from_millis(1));
@@ -250,10 +358,10 @@ mod tests {
             now = again;
             pause = (2 * pause).min(LATER_MAX);
         }
-        one.question(now, me, &replica);
-        one.answered(now, ours.0, Answer::Got { new: 1, more: true });
-        one.question(now, me, &replica);
-        one.answered(now, ours.0, Answer::Postponed);
+        one.question(now, me, &replica, 1.0);
+        one.answered(now, ours.0, now, Answer::Got { new: 1, more: true });
+        one.question(now, me, &replica, 1.0);
+        one.answered(now, ours.0, now, Answer::Postponed);
         assert_eq!(one.promises(now, &replica, ours, true, 1), Err(now.after(LATER_MIN)), "it had room meanwhile");
     }
 }

@@ -71,6 +71,12 @@ impl Purse {
         self.0.set(now, left);
     }
 
+    /// A message about `facts` facts was lost: the next costs nothing more.
+    pub fn give_back(&mut self, now: Instant, facts: f64) {
+        let level = self.0.level(now);
+        self.0.set(now, (level + price(facts)).min(level.max(self.0.full())));
+    }
+
     /// Much was moved at once: now the purse holds twice what fills it otherwise.
     pub fn refill(&mut self, now: Instant) {
         self.0.set(now, 2.0 * self.0.full());
@@ -85,6 +91,20 @@ fn price(facts: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_was_lost_is_given_back_and_not_more() {
+        let now = Instant::ZERO;
+        let mut purse = Purse::new(1.0, 2.0, now);
+        purse.give_back(now, 1.0);
+        assert_eq!(purse.0.level(now), 2.0, "a full purse stays full");
+        purse.pay(now, 1.0, 1.0);
+        purse.pay(now, 1.0, 1.0);
+        assert!(purse.due(now, 1.0) > now);
+        purse.give_back(now, 1.0);
+        assert_eq!(purse.due(now, 1.0), now);
+        assert_eq!(purse.0.level(now), 1.0);
+    }
 
     #[test]
     fn what_follows_a_large_gain_need_not_wait() {

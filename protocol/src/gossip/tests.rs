@@ -16,8 +16,8 @@ const TIMEOUT: f64 = 2.0;
 
 enum Event {
     Have { to: usize, from: RobotId, have: HaveRoot },
-    Asked { to: usize, from: usize, have: HaveVector },
-    Answered { to: usize, peer: RobotId, delta: Option<Option<crate::wire::Delta>> },
+    Asked { to: usize, from: usize, asked: Instant, have: HaveVector },
+    Answered { to: usize, peer: RobotId, asked: Instant, delta: Option<Option<crate::wire::Delta>> },
 }
 
 struct Node {
@@ -34,6 +34,8 @@ struct Swarm {
     count: u64,
     rng: ChaCha8Rng,
     loss: f64,
+    /// This one's answers are all lost.
+    mute: Option<usize>,
     control: usize,
     fetched: usize,
     messages: usize,
@@ -62,6 +64,7 @@ impl Swarm {
             count: 0,
             rng: ChaCha8Rng::seed_from_u64(7),
             loss,
+            mute: None,
             control: 0,
             fetched: 0,
             messages: 0,
@@ -110,8 +113,8 @@ impl Swarm {
                     let to = self.links[k].iter().copied().find(|to| self.nodes[*to].robot == peer).unwrap();
                     self.control += Message::SyncRequest(have.clone()).encode().len();
                     let late = self.now.after(Duration::from_secs_f64(TIMEOUT));
-                    self.at(late, Event::Answered { to: k, peer, delta: None });
-                    self.send(Event::Asked { to, from: k, have });
+                    self.at(late, Event::Answered { to: k, peer, asked: self.now, delta: None });
+                    self.send(Event::Asked { to, from: k, asked: self.now, have });
                 }
             }
         }
@@ -124,17 +127,19 @@ impl Swarm {
                 node.spread.on_have(self.now, &node.replica, from, have);
                 to
             }
-            Event::Asked { to, from, have } => {
+            Event::Asked { to, from, asked, have } => {
                 let node = &mut self.nodes[to];
                 let delta = node.replica.read_have(&have).map(|have| {
                     node.spread.on_asked(self.now, &node.replica, &have);
                     node.replica.delta_for(&have, 8192)
                 });
                 let peer = node.robot;
-                self.send(Event::Answered { to: from, peer, delta: Some(delta) });
+                if self.mute != Some(to) {
+                    self.send(Event::Answered { to: from, peer, asked, delta: Some(delta) });
+                }
                 to
             }
-            Event::Answered { to, peer, delta } => {
+            Event::Answered { to, peer, asked, delta } => {
                 let answer = match delta {
                     None => Answer::Failed,
                     Some(None) => Answer::Refused,
@@ -155,7 +160,7 @@ impl Swarm {
                     }
                 };
                 let node = &mut self.nodes[to];
-                node.spread.on_answer(self.now, &node.replica, peer, answer);
+                node.spread.on_answer(self.now, &node.replica, peer, asked, answer);
                 to
             }
         }
@@ -216,6 +221,16 @@ fn losses_are_repaired() {
         (0..8).for_each(|k| swarm.give(k, &chain(k as u8, 0, 20, 0)));
         assert!(swarm.run(300.0, true), "loss {loss}");
     }
+}
+
+#[test]
+fn a_neighbour_that_never_answers_keeps_nobody_back() {
+    // Robot 0 hears two that have all it lacks; one of them never answers.
+    let mut swarm = Swarm::new(3, |a, b| a == 0 || b - a == 1, 0.0);
+    (1..3).for_each(|k| swarm.give(k, &chain(1, 0, 100, 0)));
+    swarm.mute = Some(1);
+    assert!(swarm.run(30.0, true));
+    assert!(swarm.secs() < 3.0, "{} s", swarm.secs());
 }
 
 #[test]

@@ -54,9 +54,9 @@ impl Gossip {
         }
     }
 
-    pub fn on_answer(&mut self, now: Instant, replica: &Replica, peer: RobotId, answer: Answer) {
+    pub fn on_answer(&mut self, now: Instant, replica: &Replica, peer: RobotId, asked: Instant, answer: Answer) {
         match self {
-            Self::Ours(spread) => spread.on_answer(now, replica, peer, answer),
+            Self::Ours(spread) => spread.on_answer(now, replica, peer, asked, answer),
             Self::Plain(plain) => plain.on_answer(peer),
         }
     }

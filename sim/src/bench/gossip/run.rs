@@ -20,7 +20,7 @@ use merganser_protocol::wire::messages::Message;
 use merganser_protocol::wire::{Delta, Entry, EntryContent, Fact, HaveRoot, HaveVector};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::rc::Rc;
 
@@ -155,7 +155,8 @@ struct Node {
     replica: Replica,
     gossip: Gossip,
     links: BTreeSet<usize>,
-    asking: BTreeSet<u64>,
+    /// Questions not answered yet, and when they were asked.
+    asking: BTreeMap<u64, Instant>,
     wake: Instant,
     facts: u32,
 }
@@ -195,7 +196,7 @@ impl<'a> Swarm<'a> {
                 replica: Replica::new(&swarm, roster.clone(), &GossipConfig::default())?,
                 gossip: Gossip::new(policy, robot, Instant::ZERO),
                 links: BTreeSet::new(),
-                asking: BTreeSet::new(),
+                asking: BTreeMap::new(),
                 wake: Instant::MAX,
                 facts: 0,
             })
@@ -382,7 +383,7 @@ impl<'a> Swarm<'a> {
         self.control += bytes;
         self.questions += 1;
         let question = self.questions;
-        self.nodes[k].asking.insert(question);
+        self.nodes[k].asking.insert(question, now);
         let Some(to) = self.nodes[k].links.iter().copied().find(|to| self.nodes[*to].robot == peer) else { return };
         let late = now.after(Duration::from_secs_f64(ANSWER_SECS));
         self.queue.push(late, Event::Answered { to: k, from: to, question, delta: None });
@@ -410,9 +411,7 @@ impl<'a> Swarm<'a> {
     }
 
     fn answered(&mut self, now: Instant, k: usize, from: usize, question: u64, delta: Option<Box<Delta>>) {
-        if !self.nodes[k].asking.remove(&question) {
-            return;
-        }
+        let Some(asked) = self.nodes[k].asking.remove(&question) else { return };
         let answer = match delta {
             None => Answer::Failed,
             Some(delta) => {
@@ -422,7 +421,7 @@ impl<'a> Swarm<'a> {
         };
         let peer = self.nodes[from].robot;
         let node = &mut self.nodes[k];
-        node.gossip.on_answer(now, &node.replica, peer, answer);
+        node.gossip.on_answer(now, &node.replica, peer, asked, answer);
         self.act(now, k);
     }
 
