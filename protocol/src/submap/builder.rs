@@ -10,8 +10,8 @@
 //! the stated one is up to a sixth too small, even with w/3 added to every alignment). Only the first anchor needs
 //! care: see [`FIRST_CLOUD_SHARE`].
 
-use super::odometry::{across_gap, isotropic, motion};
-use super::planar::{Sharpener, flat};
+use super::odometry::{across_gap_after, isotropic, motion};
+use super::planar::{Sharpener, TILT_MAX, flat};
 use super::thinning::Thinner;
 use super::{Keyframe, PoseWithCovariance};
 use crate::config::{Sensor, SubmapConfig};
@@ -77,6 +77,12 @@ pub enum KeyframeError {
     /// A translation is NaN, infinite or farther than [`POSITION_MAX`] from the origin.
     #[error("keyframe position is not finite or beyond {POSITION_MAX} from the origin; use a local frame")]
     BadPosition,
+    /// A planar robot's body is tilted.
+    #[error("the body is tilted by {tilt:.2} rad, more than {TILT_MAX}; is this a planar robot? See submap.sensor")]
+    NotPlanar {
+        /// Angle between the body's and the frame's upward axis, rad.
+        tilt: f64,
+    },
     /// A coordinate of a point is NaN or infinite.
     #[error("point {index} of the keyframe is not finite; leave out invalid returns")]
     PointNotFinite {
@@ -207,6 +213,12 @@ impl SubmapBuilder {
         if !keyframe.pose.pose.translation.iter().all(|x| x.abs() <= POSITION_MAX) {
             return Err(KeyframeError::BadPosition);
         }
+        if self.config.sensor == Sensor::Laser2d {
+            let tilt = libm::acos(keyframe.pose.pose.rotation.matrix()[(2, 2)].clamp(-1.0, 1.0));
+            if tilt > TILT_MAX {
+                return Err(KeyframeError::NotPlanar { tilt });
+            }
+        }
         if keyframe.points.len() > POINTS_PER_KEYFRAME_MAX {
             return Err(KeyframeError::TooManyPoints { count: keyframe.points.len() });
         }
@@ -231,12 +243,21 @@ impl SubmapBuilder {
         }
     }
 
+    /// How far the frame of the submaps and that of the keyframes drove apart before a restart, at most: where scans
+    /// sharpen the motion, the submaps' frame is not the SLAM's.
+    fn way_apart(&self) -> f64 {
+        match self.config.sensor {
+            Sensor::Points3d => 0.0,
+            Sensor::Laser2d => f64::from(self.next_index) * self.config.distance_m,
+        }
+    }
+
     /// Compounds the motion up to `keyframe` onto the two running poses.
     fn track(&mut self, keyframe: &Keyframe, step: Option<PoseWithCovariance>) {
         let Some(step) = step else {
             self.since_finished = self.resumed_at.take().map(|t_frame_anchor| {
                 let t_anchor_body = t_frame_anchor.inverse() * self.t_frame_body;
-                across_gap(&t_anchor_body, &self.config, &keyframe.pose.covariance)
+                across_gap_after(&t_anchor_body, self.way_apart(), &self.config, &keyframe.pose.covariance)
             });
             return;
         };

@@ -23,6 +23,8 @@ mod lines;
 mod motion;
 mod register;
 mod search;
+#[cfg(test)]
+mod tests;
 
 pub use describe::describe;
 pub(super) use motion::Sharpener;
@@ -36,10 +38,8 @@ use flat::Flat;
 pub const OUT_OF_PLANE_ALIGNED: (f64, f64) = (0.4, 0.08);
 /// The same of one keyframe's motion: next to nothing, but enough that products stay well conditioned.
 pub const OUT_OF_PLANE_DRIVEN: (f64, f64) = (1e-3, 1e-4);
-/// A body that tilts by more (rad) is no planar robot...
+/// A body that tilts by more (rad) is no planar robot.
 pub const TILT_MAX: f64 = 0.17;
-/// ...nor one that climbs by more in one submap's length, m.
-pub const CLIMB_MAX_M: f64 = 1.0;
 
 /// What is left in the plane of a pose in space.
 pub(super) fn flat(pose: &Se3) -> Se3 {
