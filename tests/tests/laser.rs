@@ -15,13 +15,15 @@ use std::collections::BTreeMap;
 
 /// Relations of two robots are off by so much at most, m and °. They are themselves not exact: a tenth of those over which
 /// one robot's own way closes are 0.10 m or 1.8° off from the map that fits them best, the worst 0.25 m and 3.5°.
-const WORST: (f64, f64) = (0.6, 12.0);
+const WORST: (f64, f64) = (0.5, 6.0);
 /// Half of them by so much.
 const MEDIAN: (f64, f64) = (0.10, 1.5);
 /// An agreed alignment is false if it is farther off than this, m and °.
 const FALSE: (f64, f64) = (1.0, 8.0);
 /// A robot that turns by more than this (rad) from one keyframe to the next turns.
 const TURN_MAX: f64 = 0.05;
+/// One that takes longer than this to the next keyframe rests on the way, nobody knows where.
+const PAUSE_MAX_NANOS: i64 = 2_000_000_000;
 /// Relations over more than this time are loops, s.
 const LOOP_SECS: f64 = 20.0;
 
@@ -54,13 +56,13 @@ impl Way {
         way
     }
 
-    /// `t_map_body` at a time, by the odometry since the last keyframe; not while the robot turns: wheels and clocks are
-    /// not good enough then.
+    /// `t_map_body` at a time, by the odometry since the last keyframe; not while the robot turns or rests: wheels and
+    /// clocks are not good enough then.
     fn at(&self, stamp: i64) -> Option<Se3> {
         let next = self.stamps.partition_point(|&s| s <= stamp);
         let k = next.checked_sub(1).filter(|_| next < self.stamps.len())?;
         let turn = (self.raw[k].inverse() * self.raw[next]).rotation.angle();
-        if turn > TURN_MAX {
+        if turn > TURN_MAX || self.stamps[next] - self.stamps[k] > PAUSE_MAX_NANOS {
             return None;
         }
         let share = (stamp - self.stamps[k]) as f64 / (self.stamps[next] - self.stamps[k]) as f64;
@@ -155,5 +157,5 @@ fn three_robots_merge_on_a_real_planar_laser() {
     assert!(!alignments().filter(|edge| edge.weight > 0.0).any(|edge| wrong(&edge)), "a false alignment is used");
     assert!(distances[middle] <= MEDIAN.0 && angles[middle] <= MEDIAN.1);
     assert!(distances[last] <= WORST.0 && angles[last] <= WORST.1);
-    assert!(loops >= 20, "only {loops} loops between robots were looked at");
+    assert!(loops >= 5, "only {loops} loops between robots were looked at");
 }
