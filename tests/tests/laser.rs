@@ -47,7 +47,7 @@ impl Way {
             way.raw.push(keyframe.pose.pose);
             let closed = builder.push(keyframe).unwrap();
             let closed = closed.or_else(|| (index + 1 == recording.len()).then(|| builder.flush()).flatten());
-            for submap in closed {
+            if let Some(submap) = closed {
                 let anchor = anchors.get(&submap.index);
                 way.mapped.extend(submap.keyframes.iter().map(|t_anchor_body| Some(*anchor? * *t_anchor_body)));
             }
