@@ -1,11 +1,11 @@
 //! Planar robots with a 2-D laser (`submap.sensor = "laser_2d"`): the same path from keyframes to alignments, in three
 //! degrees of freedom.
 //!
-//! [`Sharpener`] corrects the motion between keyframes by scan matching before a submap is built of them.
+//! `Sharpener` corrects the motion between keyframes by scan matching before a submap is built of them.
 //! [`describe()`] turns a submap into the same [`Features`](super::Features), keypoints and summary as in space, with
 //! points at z = 0 and normals in the plane, so that wire, store and negotiation stay as they are. [`register()`]
-//! tries *all* poses of their keypoints on a raster of my submap ([`search`]), because a floor plan of bare walls has
-//! no local features to speak of, and judges the best of them ([`court`]).
+//! tries *all* poses of their keypoints on a raster of my submap (`search`), because a floor plan of bare walls has
+//! no local features to speak of, and judges the best of them (`court`).
 //!
 //! **What is not known.** A laser at some height over some floor sees nothing of height, roll and pitch. An alignment
 //! says of them that both robots stand on about one floor ([`OUT_OF_PLANE_ALIGNED`]); the motion of a robot that does
