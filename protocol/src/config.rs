@@ -25,6 +25,8 @@ pub struct Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SubmapConfig {
+    /// What makes the points.
+    pub sensor: Sensor,
     /// Edge of the thinning voxel. Choose the sensor's noise times three or so: 0.05 for depth cameras, 0.5 for
     /// spinning LiDAR outdoors.
     pub voxel_m: f64,
@@ -47,6 +49,7 @@ pub struct SubmapConfig {
 impl Default for SubmapConfig {
     fn default() -> Self {
         Self {
+            sensor: Sensor::Points3d,
             voxel_m: 0.1,
             distance_m: 2.0,
             rotation_deg: 60.0,
@@ -57,6 +60,20 @@ impl Default for SubmapConfig {
             gap_sigma_per_m: 0.1,
         }
     }
+}
+
+/// What makes the points, hence how submaps are described and aligned. Choose it alike on all robots of a swarm: a
+/// planar submap and one in space are not compared.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Sensor {
+    /// Surfaces in space: 3-D LiDAR, depth camera.
+    #[default]
+    #[serde(rename = "points_3d")]
+    Points3d,
+    /// A laser that scans the plane in which the robot drives. Poses are taken as planar, the keyframes' motions are
+    /// sharpened by scan matching, and nothing is claimed to be known of height and tilt.
+    #[serde(rename = "laser_2d")]
+    Laser2d,
 }
 
 /// How two submaps are aligned.

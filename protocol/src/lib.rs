@@ -17,6 +17,7 @@
 
 pub mod agent;
 pub mod align;
+pub mod carmen;
 pub mod config;
 pub mod estimate;
 pub mod geometry;

@@ -1,9 +1,10 @@
 //! Whatever lies in a folder becomes recordings, one per robot: a folder of recordings as it is; 7-Scenes RGB-D frames
-//! and LiDAR scans cut into robots by time. A cut robot has a local frame of its own (its first body pose) and a seeded
-//! drift on its true motion, and its manifest says so.
+//! and LiDAR scans cut into robots by time; a planar laser's log cut into robots with its real odometry. A robot cut
+//! from frames or scans has a local frame of its own (its first body pose) and a seeded drift on its true motion, and
+//! its manifest says so.
 
 use super::error::{Problem, RecordingError, on};
-use super::{Drift, KEYFRAMES, MANIFEST, Recording, Writer, import_lidar, import_rgbd};
+use super::{Drift, KEYFRAMES, MANIFEST, Recording, Writer, import_laser, import_lidar, import_rgbd};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::ids::Name;
@@ -14,7 +15,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Names of the robots that a sequence is cut into.
-const NAMES: [&str; 6] = ["alpha", "beta", "gamma", "delta", "epsilon", "zeta"];
+pub(super) const NAMES: [&str; 6] = ["alpha", "beta", "gamma", "delta", "epsilon", "zeta"];
 /// Robots in one data set at most: each becomes a process of its own.
 pub const ROBOTS_MAX: usize = 16;
 
@@ -27,6 +28,8 @@ pub enum Kind {
     SevenScenes,
     /// `graph.txt` and `NNNNNN/points.bin`, or `NNNNNN.bin` and `poses.txt`.
     Lidar,
+    /// One `*.clf` or `*.clf.bz2`: a planar laser's log.
+    Carmen,
 }
 
 /// Tells what `folder` holds.
@@ -51,9 +54,12 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     if any(&|name| name == import_lidar::GRAPH || name.ends_with(import_lidar::SCAN_SUFFIX)) {
         return Ok(Kind::Lidar);
     }
+    if any(&|name| import_laser::SUFFIXES.iter().any(|suffix| name.ends_with(suffix))) {
+        return Ok(Kind::Carmen);
+    }
     let why = format!(
-        "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), or LiDAR scans \
-         ({} with NNNNNN/points.bin, or NNNNNN.bin with {})",
+        "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \
+         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), or a CARMEN log (*.clf, *.clf.bz2)",
         import_rgbd::DEPTH_SUFFIX,
         import_lidar::GRAPH,
         import_lidar::POSES,
@@ -75,6 +81,10 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Vec<Recording>, Rec
         }
         Kind::Lidar => {
             import_lidar::import(data, out, seed)?;
+            out
+        }
+        Kind::Carmen => {
+            import_laser::import(data, out)?;
             out
         }
     };

@@ -8,6 +8,7 @@ pub mod cloud;
 mod drift;
 mod error;
 pub mod import;
+mod import_laser;
 mod import_lidar;
 mod import_rgbd;
 mod pcd;

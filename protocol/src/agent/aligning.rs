@@ -222,6 +222,7 @@ impl Agent {
             mine: features,
             config: self.config.align.clone(),
             voxel_m: self.config.submap.voxel_m,
+            sensor: self.config.submap.sensor,
             scale: if own_scale == ScaleKind::Metric { scale } else { ScaleKind::Unknown },
             seed: self.pair_seed(pair_of(mine, theirs)),
         };

@@ -2,12 +2,15 @@
 //! inline and charges virtual time by [`Job::kind`]; a replay runs them again instead of storing their results.
 
 use crate::align::{Model, Problem, SolverConfig};
-use crate::config::{AlignConfig, EstimateConfig, SubmapConfig};
+use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
 use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, solve_map};
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
-use crate::submap::{self, Described, Features, Keypoints, RefineError, RegisterConfig, RegisterError, Submap};
+use crate::submap::planar::FlatConfig;
+use crate::submap::{
+    self, Described, Features, Keypoints, RefineError, RegisterConfig, RegisterError, Registered, Submap,
+};
 use crate::wire::fact::{RefusalReason, ScaleKind};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -43,6 +46,8 @@ pub struct AlignJob {
     pub config: AlignConfig,
     /// Thinning voxel of our submaps, m: the unit of the noise bound.
     pub voxel_m: f64,
+    /// What made our points.
+    pub sensor: Sensor,
     /// SE(3), or SIM(3) if either side's unit is unknown.
     pub scale: ScaleKind,
     /// Seed of the sampler: our own, so that the two endpoints are independent.
@@ -175,26 +180,36 @@ impl SolveJob {
 }
 
 impl AlignJob {
-    /// Where units are metres, clouds judge the poses that matches suggest; else the matches alone decide.
+    /// Where units are metres, clouds judge the poses that matches suggest; else the matches alone decide. In the plane
+    /// all poses are tried.
     fn run(&self) -> Result<Measured, RefusalReason> {
-        match self.scale {
-            ScaleKind::Metric => self.register(),
-            ScaleKind::Unknown => self.align(),
+        match (self.sensor, self.scale) {
+            (Sensor::Laser2d, ScaleKind::Metric) => {
+                self.measured(submap::planar::register(&self.theirs, &self.mine, &FlatConfig::default()))
+            }
+            (Sensor::Laser2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput),
+            (Sensor::Points3d, ScaleKind::Metric) => self.register(),
+            (Sensor::Points3d, ScaleKind::Unknown) => self.align(),
         }
     }
 
     fn register(&self) -> Result<Measured, RefusalReason> {
         let config =
             RegisterConfig { solver: self.solver(), fit_min: self.config.fit_min, ..RegisterConfig::default() };
-        let found = submap::register(&self.theirs, &self.mine, &config).map_err(|error| match error {
+        self.measured(submap::register(&self.theirs, &self.mine, &config))
+    }
+
+    fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, RefusalReason> {
+        let found = found.map_err(|error| match error {
             RegisterError::NoConsensus { .. } => RefusalReason::NoConsensus,
             RegisterError::Ambiguous { .. } => RefusalReason::Ambiguous,
             RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate,
             RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit,
             RegisterError::Refine(_) => RefusalReason::NoConsensus,
-            RegisterError::Solver(_) | RegisterError::Thinning { .. } | RegisterError::Crowded { .. } => {
-                RefusalReason::BadInput
-            }
+            RegisterError::Solver(_)
+            | RegisterError::Thinning { .. }
+            | RegisterError::Crowded { .. }
+            | RegisterError::NotPlanar => RefusalReason::BadInput,
         })?;
         if found.log10_nfa > self.config.log10_nfa_max {
             return Err(RefusalReason::NoConsensus);

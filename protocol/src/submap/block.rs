@@ -147,6 +147,11 @@ impl<const N: usize> Block<N> {
         f64::from(self.voxel)
     }
 
+    /// Frame units per position step.
+    pub fn step(&self) -> f64 {
+        f64::from(self.step)
+    }
+
     /// The point in stored form (the normal's roughness is in voxels); `None` if it lies too far out.
     pub fn store(&self, position: &Vector3<f64>, normal: &Normal, descriptor: [u8; N]) -> Option<Stored<N>> {
         let steps = position.map(|x| (x / f64::from(self.step)).round());

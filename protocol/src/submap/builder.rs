@@ -10,10 +10,11 @@
 //! the stated one is up to a sixth too small, even with w/3 added to every alignment). Only the first anchor needs
 //! care: see [`FIRST_CLOUD_SHARE`].
 
-use super::odometry::{across_gap, isotropic, motion};
+use super::odometry::{across_gap_after, isotropic, motion};
+use super::planar::{Sharpener, TILT_MAX, flat};
 use super::thinning::Thinner;
 use super::{Keyframe, PoseWithCovariance};
-use crate::config::SubmapConfig;
+use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
@@ -76,6 +77,12 @@ pub enum KeyframeError {
     /// A translation is NaN, infinite or farther than [`POSITION_MAX`] from the origin.
     #[error("keyframe position is not finite or beyond {POSITION_MAX} from the origin; use a local frame")]
     BadPosition,
+    /// A planar robot's body is tilted.
+    #[error("the body is tilted by {tilt:.2} rad, more than {TILT_MAX}; is this a planar robot? See submap.sensor")]
+    NotPlanar {
+        /// Angle between the body's and the frame's upward axis, rad.
+        tilt: f64,
+    },
     /// A coordinate of a point is NaN or infinite.
     #[error("point {index} of the keyframe is not finite; leave out invalid returns")]
     PointNotFinite {
@@ -112,6 +119,9 @@ pub struct SubmapBuilder {
     open: Option<Open>,
     /// A keyframe was refused since the last accepted one.
     gap: bool,
+    /// Where the body is: as the SLAM has it, or a laser's scans.
+    t_frame_body: Se3,
+    sharpener: Sharpener,
 }
 
 #[derive(Clone, Debug)]
@@ -131,7 +141,17 @@ struct Open {
 impl SubmapBuilder {
     /// A builder at the start of a new frame.
     pub fn new(config: SubmapConfig) -> Self {
-        Self { config, next_index: 0, last: None, since_finished: None, resumed_at: None, open: None, gap: false }
+        Self {
+            config,
+            next_index: 0,
+            last: None,
+            since_finished: None,
+            resumed_at: None,
+            open: None,
+            gap: false,
+            t_frame_body: Se3::identity(),
+            sharpener: Sharpener::default(),
+        }
     }
 
     /// A builder that goes on after a restart of the agent (not of the SLAM): submaps below `next_index` exist, the
@@ -153,7 +173,13 @@ impl SubmapBuilder {
             self.gap |= !matches!(error, KeyframeError::StampNotRising { .. });
             return Err(error);
         }
-        self.track(&keyframe);
+        let step = self.step(&keyframe);
+        self.t_frame_body = match (&step, self.config.sensor) {
+            (Some(step), Sensor::Laser2d) => self.t_frame_body * step.pose,
+            (None, Sensor::Laser2d) => flat(&keyframe.pose.pose),
+            (_, Sensor::Points3d) => keyframe.pose.pose,
+        };
+        self.track(&keyframe, step);
         self.extend(&keyframe);
         self.last = Some(Keyframe { points: Vec::new(), ..keyframe });
         self.gap = false;
@@ -187,6 +213,12 @@ impl SubmapBuilder {
         if !keyframe.pose.pose.translation.iter().all(|x| x.abs() <= POSITION_MAX) {
             return Err(KeyframeError::BadPosition);
         }
+        if self.config.sensor == Sensor::Laser2d {
+            let tilt = libm::acos(keyframe.pose.pose.rotation.matrix()[(2, 2)].clamp(-1.0, 1.0));
+            if tilt > TILT_MAX {
+                return Err(KeyframeError::NotPlanar { tilt });
+            }
+        }
         if keyframe.points.len() > POINTS_PER_KEYFRAME_MAX {
             return Err(KeyframeError::TooManyPoints { count: keyframe.points.len() });
         }
@@ -202,16 +234,33 @@ impl SubmapBuilder {
         Ok(())
     }
 
+    /// The motion since the last keyframe, if there was one.
+    fn step(&mut self, keyframe: &Keyframe) -> Option<PoseWithCovariance> {
+        let step = self.last.as_ref().map(|last| motion(last, keyframe, self.gap, &self.config));
+        match self.config.sensor {
+            Sensor::Points3d => step,
+            Sensor::Laser2d => self.sharpener.sharpen(step, &keyframe.points, self.config.voxel_m),
+        }
+    }
+
+    /// How far the frame of the submaps and that of the keyframes drove apart before a restart, at most: where scans
+    /// sharpen the motion, the submaps' frame is not the SLAM's.
+    fn way_apart(&self) -> f64 {
+        match self.config.sensor {
+            Sensor::Points3d => 0.0,
+            Sensor::Laser2d => f64::from(self.next_index) * self.config.distance_m,
+        }
+    }
+
     /// Compounds the motion up to `keyframe` onto the two running poses.
-    fn track(&mut self, keyframe: &Keyframe) {
-        let Some(last) = &self.last else {
+    fn track(&mut self, keyframe: &Keyframe, step: Option<PoseWithCovariance>) {
+        let Some(step) = step else {
             self.since_finished = self.resumed_at.take().map(|t_frame_anchor| {
-                let t_anchor_body = t_frame_anchor.inverse() * keyframe.pose.pose;
-                across_gap(&t_anchor_body, &self.config, &keyframe.pose.covariance)
+                let t_anchor_body = t_frame_anchor.inverse() * self.t_frame_body;
+                across_gap_after(&t_anchor_body, self.way_apart(), &self.config, &keyframe.pose.covariance)
             });
             return;
         };
-        let step = motion(last, keyframe, self.gap, &self.config);
         self.since_finished = self.since_finished.map(|since| since.compose(&step));
         if let Some(open) = &mut self.open {
             open.motions.push(step);
@@ -220,23 +269,26 @@ impl SubmapBuilder {
 
     /// Adds `keyframe` to the open submap, which it begins if none is open.
     fn extend(&mut self, keyframe: &Keyframe) {
+        let t_frame_body = self.t_frame_body;
         let open = self.open.get_or_insert_with(|| {
             let at_origin = isotropic(FIRST_ANCHOR_SIGMA, FIRST_ANCHOR_SIGMA, &keyframe.pose.covariance);
-            let first = PoseWithCovariance { pose: keyframe.pose.pose, covariance: at_origin };
+            let first = PoseWithCovariance { pose: t_frame_body, covariance: at_origin };
             Open {
                 stamps: [keyframe.stamp; 2],
                 odometry: self.since_finished.unwrap_or(first),
-                t_frame_first: keyframe.pose.pose,
+                t_frame_first: t_frame_body,
                 motions: Vec::new(),
                 keyframes: Vec::new(),
                 cloud: Thinner::new(self.config.voxel_m, self.config.points_max),
             }
         });
-        let t_first_body = open.t_frame_first.inverse() * keyframe.pose.pose;
+        let t_first_body = open.t_frame_first.inverse() * t_frame_body;
         open.stamps[1] = keyframe.stamp;
         let position = u16::try_from(open.keyframes.len()).unwrap_or(u16::MAX);
         open.keyframes.push(t_first_body);
-        open.cloud.add(keyframe.points.iter().map(|p| moved(&t_first_body, p.map(f64::from))), position);
+        let is_flat = self.config.sensor == Sensor::Laser2d;
+        let height = |p: &[f32; 3]| if is_flat { [p[0], p[1], 0.0] } else { *p };
+        open.cloud.add(keyframe.points.iter().map(|p| moved(&t_first_body, height(p).map(f64::from))), position);
     }
 
     fn is_complete(&self) -> bool {

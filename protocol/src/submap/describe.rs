@@ -5,11 +5,12 @@ use super::Submap;
 use super::block::Block;
 use super::descriptor::{Code, Projection};
 use super::features::{Codes, FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints, UNSEEN, VIEWPOINTS_MAX, in_voxels};
+use super::planar;
 use super::rings;
 use super::sampling::spread;
 use super::summary::Summary;
 use super::surface::{Normal, normals};
-use crate::config::SubmapConfig;
+use crate::config::{Sensor, SubmapConfig};
 use nalgebra::Vector3;
 
 /// Neighbours that a keypoint needs at least for its descriptor to mean something.
@@ -33,6 +34,13 @@ pub struct Described {
 
 /// Normals, keypoints with descriptors, and summary of a submap.
 pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
+    match config.sensor {
+        Sensor::Points3d => in_space(submap, config),
+        Sensor::Laser2d => planar::describe(submap, config),
+    }
+}
+
+fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {
     let points: Vec<[f32; 3]> = submap.cloud.iter().take(FEATURES_MAX).copied().collect();
     let extent = [0, 1, 2].map(|axis| points.iter().fold(0.0, |most: f32, p| most.max(p[axis].abs())));
     let mut block = Block::new(config.voxel_m, extent.iter().fold(0.0, |most, &e| most.max(f64::from(e))));

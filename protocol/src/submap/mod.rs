@@ -22,6 +22,7 @@ mod hypotheses;
 mod matching;
 mod near;
 mod odometry;
+pub mod planar;
 pub mod refine;
 pub mod register;
 mod rings;

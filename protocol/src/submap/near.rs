@@ -58,32 +58,47 @@ impl Near {
 
     /// The piece nearest to `at` within `radius` of those that `fit`; of several, the first sorted in.
     pub fn nearest(&self, at: &[f32; 3], radius: f32, fits: impl Fn(&Piece) -> bool) -> Option<&Piece> {
+        let mut best = (radius * radius, None);
+        self.look(at, radius, |piece, squared| {
+            let nearer = squared < best.0 || (squared == best.0 && best.1.is_none());
+            if nearer && fits(piece) {
+                best = (squared, Some(piece));
+            }
+        });
+        best.1
+    }
+
+    /// Shows every piece within `radius` of `at`.
+    pub fn within(&self, at: &[f32; 3], radius: f32, mut each: impl FnMut(&Piece)) {
+        self.look(at, radius, |piece, squared| {
+            if squared <= radius * radius {
+                each(piece);
+            }
+        });
+    }
+
+    /// Shows the pieces of every cell within `radius`, with their squared distances.
+    fn look<'a>(&'a self, at: &[f32; 3], radius: f32, mut each: impl FnMut(&'a Piece, f32)) {
         if self.pieces.is_empty() {
-            return None;
+            return;
         }
         let mut run = [(0, 0); 3];
         for k in 0..3 {
             let (from, to) = (self.cell(at[k] - radius, k).max(0), self.cell(at[k] + radius, k));
             let to = to.min(self.dims[k] as i64 - 1);
             if from > to {
-                return None;
+                return;
             }
             run[k] = (from as usize, to as usize);
         }
-        let mut best = (radius * radius, None);
         for x in run[0].0..=run[0].1 {
             for y in run[1].0..=run[1].1 {
                 let (first, last) = (self.position(x, y, run[2].0), self.position(x, y, run[2].1));
                 for piece in &self.pieces[self.starts[first] as usize..self.starts[last + 1] as usize] {
-                    let squared: f32 = (0..3).map(|k| (piece.point[k] - at[k]) * (piece.point[k] - at[k])).sum();
-                    let nearer = squared < best.0 || (squared == best.0 && best.1.is_none());
-                    if nearer && fits(piece) {
-                        best = (squared, Some(piece));
-                    }
+                    each(piece, (0..3).map(|k| (piece.point[k] - at[k]) * (piece.point[k] - at[k])).sum());
                 }
             }
         }
-        best.1
     }
 
     /// The cell of a coordinate, which may lie outside of the table: just before it counts as the first. Saturates.

@@ -39,7 +39,12 @@ pub fn motion(last: &Keyframe, next: &Keyframe, gap: bool, config: &SubmapConfig
 /// A motion over which odometry is not known: σ = `gap_sigma_per_m` × (distance + one voxel) for the translation and
 /// `gap_sigma_per_m` × (turn + 0.2 rad per submap's length) for the rotation.
 pub fn across_gap(pose: &Se3, config: &SubmapConfig, otherwise: &Covariance<6>) -> PoseWithCovariance {
-    let distance = pose.translation.norm() + config.voxel_m;
+    across_gap_after(pose, 0.0, config, otherwise)
+}
+
+/// The same where the two ends were besides told by two odometries that both drove `way`.
+pub fn across_gap_after(pose: &Se3, way: f64, config: &SubmapConfig, otherwise: &Covariance<6>) -> PoseWithCovariance {
+    let distance = pose.translation.norm() + config.voxel_m + way;
     let turn = pose.rotation.angle() + GAP_TURN_PER_SUBMAP * distance / config.distance_m;
     let (rho, phi) = (config.gap_sigma_per_m * distance, config.gap_sigma_per_m * turn);
     PoseWithCovariance { pose: *pose, covariance: isotropic(rho, phi, otherwise) }

@@ -28,11 +28,11 @@ use thiserror::Error;
 const LOG10: f64 = core::f64::consts::LOG10_E;
 
 /// Clouds thinned to voxels that differ by more than this factor are not compared.
-const VOXEL_RATIO_MAX: f64 = 1.5;
+pub(super) const VOXEL_RATIO_MAX: f64 = 1.5;
 /// Largest standard deviation of a rotation, rad: a covariance speaks of the neighbourhood in which rotations add up.
 const ROTATION_SIGMA_MAX: f64 = 0.25;
 /// Share of keypoints that may lie in one half-voxel cell with another: of a thinned cloud's hardly any do.
-const CROWDED_MAX: f64 = 0.1;
+pub(super) const CROWDED_MAX: f64 = 0.1;
 
 /// When an alignment is refused.
 #[derive(Clone, Debug, PartialEq)]
@@ -120,6 +120,9 @@ pub enum RegisterError {
         /// Share of those that share a place.
         share: f64,
     },
+    /// One submap is planar, the other one is not.
+    #[error("a planar submap cannot be compared with one in space; set submap.sensor alike on all robots")]
+    NotPlanar,
     /// The pose does not refine.
     #[error(transparent)]
     Refine(#[from] RefineError),
@@ -206,7 +209,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
 }
 
 /// Share of the keypoints in a half-voxel cell with another.
-fn crowded(theirs: &Keypoints) -> f64 {
+pub(super) fn crowded(theirs: &Keypoints) -> f64 {
     let cell = 0.5 * theirs.voxel();
     let cells: BTreeSet<[i64; 3]> =
         theirs.surfels().iter().map(|s| [0, 1, 2].map(|k| (s.position[k] / cell).floor() as i64)).collect();

@@ -20,7 +20,7 @@ const NUMBERS: usize = 16;
 /// Levels of each.
 const LEVELS: usize = 8;
 /// Shares.
-const WORDS: usize = NUMBERS * LEVELS;
+pub(super) const WORDS: usize = NUMBERS * LEVELS;
 /// Version, numbers, voxel.
 const HEADER_LEN: usize = 6;
 /// Bytes of an encoded summary.
@@ -80,6 +80,11 @@ impl Summary {
                 }
             }
         }
+        Self::of_shares(voxel, &shares)
+    }
+
+    /// The summary of a submap thinned to `voxel` (frame units), from shares that add up as they please.
+    pub(super) fn of_shares(voxel: f64, shares: &[f32; WORDS]) -> Self {
         let most = shares.iter().fold(f32::MIN_POSITIVE, |most, &share| most.max(share));
         let words = shares.map(|share| (255.0 * (share / most).sqrt()).round() as u8);
         Self::new(voxel as f32, words)
