@@ -120,7 +120,7 @@ fn bad_manifests_are_told() {
     expect(&with("robot = \"alpha\"", "robot = \"Alpha\""), MANIFEST, Some(3), "\"Alpha\" is not a name");
     expect(&with("keyframes = 4", "keyframes = 0"), MANIFEST, None, "holds 1 to 1000000");
     expect(&with("voxel_m = 0.1", "voxel_m = -1.0"), MANIFEST, None, "config.submap.voxel_m");
-    expect(&with("voxel_m = 0.1", "voxel = 0.1"), MANIFEST, Some(11), "voxel");
+    expect(&with("voxel_m = 0.1", "voxel = 0.1"), MANIFEST, Some(12), "voxel");
     expect(&with("format = ", "format == "), MANIFEST, Some(1), "");
 }
 
