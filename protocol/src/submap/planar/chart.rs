@@ -11,7 +11,7 @@ pub const FREE: u16 = 1 << SECTORS;
 /// Edge of a cell.
 pub const EDGE: f64 = 2.0;
 /// Cells along an axis at most: what lies farther out is left out.
-const CELLS_MAX: usize = 1 << 10;
+pub const CELLS_MAX: usize = 1 << 10;
 /// Beams end where they are this near to the wall that they hit...
 const SHORT: f64 = 3.0;
 /// ...or this far before something that is no wall, or a wall that they graze...

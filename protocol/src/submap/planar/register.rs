@@ -6,7 +6,7 @@ use super::super::features::{Features, Keypoints, UNSEEN};
 use super::super::refine::{RefineError, Refined};
 use super::super::register::{CROWDED_MAX, RegisterError, Registered, VOXEL_RATIO_MAX, crowded};
 use super::OUT_OF_PLANE_ALIGNED;
-use super::chart::{Beam, Chart};
+use super::chart::{Beam, CELLS_MAX, Chart, EDGE};
 use super::court::{ALIKE, Court, Judged};
 use super::describe::unpacked;
 use super::fit::{Walls, system};
@@ -14,6 +14,8 @@ use super::flat::{Flat, in_space};
 use super::search;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
+/// Farthest that a point may lie from its anchor along an axis, voxels.
+const WALLS_MAX: f64 = EDGE * CELLS_MAX as f64 / 2.0;
 /// From natural to base-10 logarithms.
 const LOG10: f64 = core::f64::consts::LOG10_E;
 /// A cell is free if so many of my beams passed through.
@@ -111,9 +113,11 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &FlatConfig) -> Res
     })
 }
 
-/// Oriented points, in my voxels.
+/// Oriented points, in my voxels. What lies farther out than any chart reaches is left out: it would only lengthen the
+/// search.
 fn walls(surfels: &[Surfel], voxel: f64) -> Walls {
-    let clear = surfels.iter().filter(|s| s.roughness.is_some() && s.normal.xy().norm() > 0.5);
+    let within = |s: &&Surfel| s.position.xy().amax() <= WALLS_MAX * voxel;
+    let clear = surfels.iter().filter(within).filter(|s| s.roughness.is_some() && s.normal.xy().norm() > 0.5);
     let (points, normals) = clear.map(|s| (s.position.xy() / voxel, s.normal.xy().normalize())).unzip();
     Walls { points, normals }
 }
@@ -177,4 +181,18 @@ fn refined(court: &Court, pose: &Flat, voxel: f64) -> Result<Refined, RefineErro
     let covariance = from_middle * covariance * from_middle.transpose();
     let pose = in_space(pose, voxel, &covariance, OUT_OF_PLANE_ALIGNED);
     Ok(Refined { pose, rms: system.sigma * voxel, pairs: system.pairs, share })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_count_up_to_the_edge_of_any_chart() {
+        let voxel = 0.1;
+        let at =
+            |x: f64| Surfel { position: Vector3::new(x * voxel, 0.0, 0.0), normal: Vector3::x(), roughness: Some(0.1) };
+        let kept = walls(&[at(0.0), at(-WALLS_MAX), at(WALLS_MAX + 1.0), at(1e6)], voxel);
+        assert_eq!(kept.points.len(), 2);
+    }
 }
