@@ -201,7 +201,7 @@ impl Spread {
                 self.purse.give_back(now, gain);
             }
             match neighbour.promises(now, replica, (root, count), self.me < *robot, strangers) {
-                Ok(gain) => best.push((*robot, gain)),
+                Ok(gain) => best.push((*robot, neighbour.hope() * gain)),
                 Err(again) => self.wake = self.wake.min(again),
             }
         }

@@ -131,22 +131,15 @@ impl Neighbour {
         Some(question.gain)
     }
 
-    /// How many facts a question may bring; or when to think about it again. Called when no question keeps others back:
-    /// one that is under way is overdue. Our root and count; `first`: where both may
-    /// ask, it is we who do; `strangers`: neighbours we never compared with.
-    pub fn promises(
-        &mut self,
-        now: Instant,
-        replica: &Replica,
-        (root, count): ([u8; 8], u64),
-        first: bool,
-        strangers: usize,
-    ) -> Result<f64, Instant> {
-        let hope = if self.asked.is_some() { HOPE } else { 1.0 };
-        self.may_bring(now, replica, (root, count), first, strangers).map(|gain| hope * gain)
+    /// Share of what it promises that may be counted on. Called when no question keeps others back: one that is under way
+    /// is overdue.
+    pub fn hope(&self) -> f64 {
+        if self.asked.is_some() { HOPE } else { 1.0 }
     }
 
-    fn may_bring(
+    /// How many facts a question may bring; or when to think about it again. Our root and count; `first`: where both may
+    /// ask, it is we who do; `strangers`: neighbours we never compared with.
+    pub fn promises(
         &mut self,
         now: Instant,
         replica: &Replica,
@@ -327,7 +320,7 @@ mod tests {
             let ends = one.patience_ends(now, longest).unwrap();
             assert_eq!(one.patience_ends(ends, longest), None);
             assert!(one.lost().is_some() && one.lost().is_none(), "given back once");
-            assert!(one.promises(ends, &replica, ours, true, 1).unwrap() < 0.5 * STRANGERS, "others come first");
+            assert!(one.promises(ends, &replica, ours, true, 1).is_ok() && one.hope() < 0.5, "others come first");
             pauses.push(ends.since(now));
             now = ends;
         }
