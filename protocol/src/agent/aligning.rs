@@ -98,8 +98,11 @@ impl Agent {
     pub(super) fn start_aligning(&mut self) {
         if self.negotiation.take_stirred() && !self.receive_only {
             self.start_verifying();
-            self.start_proposing();
-            self.drop_idle_fetches();
+            if self.has_room() || !self.negotiation.fetches.is_empty() {
+                let active = self.active_candidates();
+                self.start_proposing(&active);
+                self.drop_idle_fetches(&active);
+            }
         }
         self.start_fetching();
     }
@@ -130,15 +133,11 @@ impl Agent {
         blob(fact.i) == Some(fact.blobs[0]) && blob(fact.j) == Some(fact.blobs[1])
     }
 
-    fn start_proposing(&mut self) {
-        if !self.has_room() {
-            return;
-        }
-        for candidate in self.active_candidates() {
+    fn start_proposing(&mut self, active: &[Candidate]) {
+        for &Candidate { mine, theirs, .. } in active {
             if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
                 break;
             }
-            let Candidate { mine, theirs, .. } = candidate;
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
             if self.negotiation.features(mine).is_none() || self.start_alignment(mine, theirs, Purpose::Propose) {
                 self.negotiation.mark_tried(pair_of(mine, theirs));
@@ -182,7 +181,7 @@ impl Agent {
 
     /// Nobody in reach has the submap's keypoints.
     fn is_out_of_reach(&self, id: SubmapId) -> bool {
-        self.knowledge.submap(id).is_some_and(|fact| self.negotiation.out_of_reach.contains(&fact.blob))
+        !self.negotiation.out_of_reach.is_empty() && self.knowledge.submap(id).is_some_and(|fact| self.negotiation.out_of_reach.contains(&fact.blob))
     }
 
     /// Alignments that wait for our answer and can be worked on now.
@@ -245,9 +244,10 @@ impl Agent {
         u64::from_le_bytes([a, b, c, d, e, f, g, h]) ^ self.seed
     }
 
-    /// Stops fetching what no pair needs any more.
-    fn drop_idle_fetches(&mut self) {
-        let mut wanted: BTreeSet<SubmapId> = self.active_candidates().iter().map(|c| c.theirs).collect();
+    /// Stops fetching what no pair needs any more: of those that were active, the ones that have not begun.
+    fn drop_idle_fetches(&mut self, active: &[Candidate]) {
+        let waits = |c: &&Candidate| !self.negotiation.is_tried(pair_of(c.mine, c.theirs));
+        let mut wanted: BTreeSet<SubmapId> = active.iter().filter(waits).map(|c| c.theirs).collect();
         for id in self.answers_owed() {
             wanted.extend(self.knowledge.alignment(id).into_iter().flat_map(|fact| [fact.i, fact.j]));
         }

@@ -259,7 +259,7 @@ impl Knowledge {
 
     /// The estimation problem: one agreed alignment per pair, all sightings, and the unbroken chain of submaps of every
     /// frame they tie, and of `own`. `odometry` reads `t_prev_this` from where a submap's fact is held.
-    pub fn question(&self, own: FrameId, odometry: impl Fn(&Known) -> Option<PoseWithCovariance>) -> Question {
+    pub fn question(&self, own: FrameId, mut odometry: impl FnMut(&Known) -> Option<PoseWithCovariance>) -> Question {
         let chains = self.chains();
         let place = |id: SubmapId| {
             let index = chains.get(&id.frame)?.binary_search(&id.index).ok()?;
@@ -282,13 +282,13 @@ impl Knowledge {
             sightings.filter_map(|(entry, fact)| tie(*entry, fact.i, fact.j, Relative::Metric(fact.t_i_j))).collect();
         let ties = alignments.iter().chain(&sightings);
         let tied: BTreeSet<FrameId> = ties.flat_map(|tie| [tie.i.frame, tie.j.frame]).chain([own]).collect();
-        let chain = |frame: &FrameId| {
+        let mut chain = |frame: &FrameId| {
             let known = |index: &u32| self.submap(SubmapId { frame: *frame, index: *index });
             let mut anchors = chains.get(frame)?.iter().filter_map(known).peekable();
             let scale = anchors.peek()?.scale;
-            Some((*frame, FrameChain { scale, odometry: anchors.map_while(&odometry).collect() }))
+            Some((*frame, FrameChain { scale, odometry: anchors.map_while(&mut odometry).collect() }))
         };
-        let frames = tied.iter().filter_map(chain).collect();
+        let frames = tied.iter().filter_map(&mut chain).collect();
         let (posed, alone): (BTreeMap<_, _>, BTreeMap<_, _>) =
             chains.into_iter().partition(|(frame, _)| tied.contains(frame));
         let gaps =

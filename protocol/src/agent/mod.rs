@@ -20,6 +20,7 @@ mod negotiation;
 mod shortlist;
 mod solving;
 mod stats;
+mod steps;
 mod traffic;
 mod view;
 
@@ -41,6 +42,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use solving::MapState;
 use stats::Stats;
+use steps::Steps;
 use std::collections::{BTreeMap, VecDeque};
 use thiserror::Error;
 
@@ -438,6 +440,7 @@ impl Agent {
     /// Forgets and learns everything again: at start, and when a quarantine takes facts away.
     fn relearn(&mut self) {
         self.knowledge = Knowledge::default();
+        self.map.steps = Steps::default();
         self.negotiation.clear_candidates();
         // What calls for something is heard once all is known; of submaps ours call for all pairs, verdicts for nothing
         // but news, and these are old.

@@ -4,7 +4,8 @@ use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{Job, SolveJob, Solved};
 use super::knowledge::{Gaps, Known, Question};
-use crate::geometry::{PoseWithCovariance, Relative};
+use super::steps::Steps;
+use crate::geometry::Relative;
 use crate::ids::{EntryId, FrameId, Hash, SubmapId};
 use crate::time::Instant;
 use crate::wire::fact::{Fact, SubmapFact};
@@ -30,6 +31,8 @@ pub(super) struct MapState {
     pub(super) digest: Hash,
     next_solve: Instant,
     merged: BTreeSet<FrameId>,
+    /// The odometry of the last problem posed.
+    pub(super) steps: Steps,
 }
 
 impl Agent {
@@ -41,7 +44,10 @@ impl Agent {
         if self.map.dirty && self.map.solving.is_none() && self.now >= self.map.next_solve {
             let config = self.config.estimate.clone();
             let own = self.me.frame;
-            let Question { problem, alone, gaps } = self.knowledge.question(own, |known| self.odometry(known));
+            let mut steps = core::mem::take(&mut self.map.steps).renewed();
+            let odometry = |known: &Known| steps.of(known, || self.submap_fact(known).map(|fact| fact.odometry));
+            let Question { problem, alone, gaps } = self.knowledge.question(own, odometry);
+            self.map.steps = steps;
             let job = SolveJob { problem, config, own };
             (self.map.posed_from, self.map.posed_alone, self.map.posed_gaps) = (Some(own), alone, gaps);
             self.map.dirty = false;
@@ -90,11 +96,6 @@ impl Agent {
 
     fn solved_for_own(&self) -> Option<&Solved> {
         (self.map.seen_from == Some(self.me.frame)).then_some(&self.map.solved)
-    }
-
-    /// `t_prev_this` of a submap, from the entry that holds it now.
-    pub(super) fn odometry(&self, known: &Known) -> Option<PoseWithCovariance> {
-        self.submap_fact(known).map(|fact| fact.odometry)
     }
 
     /// A submap's fact, from the entry that holds it now.

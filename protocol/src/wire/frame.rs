@@ -195,11 +195,14 @@ pub(super) fn parse_body<'a, T: Deserialize<'a>>(kind: FrameKind, bytes: &'a [u8
     if rest.is_empty() { Ok(body) } else { Err(WireError::Trailing { kind, rest: rest.len() }) }
 }
 
+/// Room for most facts and frames, so that writing one allocates once.
+const USUAL_LEN: usize = 256;
+
 /// The postcard encoding of plain wire data.
 pub(super) fn to_bytes(value: &impl Serialize) -> Vec<u8> {
     #[expect(
         clippy::expect_used,
         reason = "postcard fails only for sequences of unknown length, which no wire type has"
     )]
-    postcard::to_stdvec(value).expect("wire types have known lengths")
+    postcard::to_extend(value, Vec::with_capacity(USUAL_LEN)).expect("wire types have known lengths")
 }
