@@ -2,6 +2,7 @@
 //! per message by the network; these are the ones with a beginning and an end.
 
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// One scheduled fault. Times are in seconds since the start of the run; robots go by name.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -186,17 +187,25 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// Whether it keeps messages of the robot `from` from the robot `to`.
-    pub fn severs(&self, from: &str, to: &str) -> bool {
+    /// The directed links that it severs among robots of these names, as places in `names`.
+    pub fn severed(&self, names: &[&str]) -> Vec<(usize, usize)> {
+        let links = |cuts: &dyn Fn(usize, usize) -> bool| {
+            let from_all = (0..names.len()).flat_map(|from| (0..names.len()).map(move |to| (from, to)));
+            from_all.filter(|&(from, to)| from != to && cuts(from, to)).collect()
+        };
         match self {
             Self::Partition { groups, .. } => {
-                let group = |name: &str| groups.iter().position(|group| group.iter().any(|member| member == name));
+                let members =
+                    groups.iter().enumerate().flat_map(|(k, group)| group.iter().map(move |name| (&**name, k)));
+                // Named twice, a robot is in the first group.
+                let group_of: BTreeMap<&str, usize> = members.rev().collect();
+                let group: Vec<Option<&usize>> = names.iter().map(|name| group_of.get(name)).collect();
                 // Those in no group are cut off from one another as well.
-                group(from).is_none() || group(from) != group(to)
+                links(&|from, to| group[from].is_none() || group[from] != group[to])
             }
-            Self::Isolate { robot, .. } => robot == from || robot == to,
-            Self::OneWay { from: one, to: other, .. } => one == from && other == to,
-            _ => false,
+            Self::Isolate { robot, .. } => links(&|from, to| robot == names[from] || robot == names[to]),
+            Self::OneWay { from: one, to: other, .. } => links(&|from, to| one == names[from] && other == names[to]),
+            _ => Vec::new(),
         }
     }
 
@@ -362,4 +371,31 @@ pub struct FaultCounts {
     pub keyframes_missed: u64,
     /// What `gossip.link_bytes_per_sec` held back on robots that ran to the end, since they started.
     pub held_back: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_partition_severs_between_groups_and_those_in_none_from_all() {
+        let group = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<String>>();
+        let groups = vec![group(&["a", "b"]), group(&["c", "a"])];
+        let fault = Fault::Partition { at: 1.0, lasts: 1.0, groups };
+        let names = ["a", "b", "c", "d", "e"];
+        let open = |from, to| !fault.severed(&names).contains(&(from, to));
+        let together: Vec<(usize, usize)> =
+            (0..5).flat_map(|from| (0..5).map(move |to| (from, to))).filter(|&(f, t)| f != t && open(f, t)).collect();
+        assert_eq!(together, [(0, 1), (1, 0)]);
+    }
+
+    #[test]
+    fn others_sever_what_they_name() {
+        let names = ["a", "b", "c"];
+        let isolate = Fault::Isolate { at: 1.0, lasts: 1.0, robot: "b".into() };
+        assert_eq!(isolate.severed(&names), [(0, 1), (1, 0), (1, 2), (2, 1)]);
+        let one_way = Fault::OneWay { at: 1.0, lasts: 1.0, from: "c".into(), to: "a".into() };
+        assert_eq!(one_way.severed(&names), [(2, 0)]);
+        assert!(Fault::Leave { at: 1.0, robot: "a".into() }.severed(&names).is_empty());
+    }
 }

@@ -181,7 +181,8 @@ impl Agent {
 
     /// Nobody in reach has the submap's keypoints.
     fn is_out_of_reach(&self, id: SubmapId) -> bool {
-        !self.negotiation.out_of_reach.is_empty() && self.knowledge.submap(id).is_some_and(|fact| self.negotiation.out_of_reach.contains(&fact.blob))
+        !self.negotiation.out_of_reach.is_empty()
+            && self.knowledge.submap(id).is_some_and(|fact| self.negotiation.out_of_reach.contains(&fact.blob))
     }
 
     /// Alignments that wait for our answer and can be worked on now.

@@ -42,8 +42,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use solving::MapState;
 use stats::Stats;
-use steps::Steps;
 use std::collections::{BTreeMap, VecDeque};
+use steps::Steps;
 use thiserror::Error;
 
 pub use condensing::GONE_IN_A_ROW_MAX;

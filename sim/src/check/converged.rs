@@ -16,6 +16,9 @@ const LAG_SECS_PER_ROBOT: f64 = 2.0;
 const LAG_SECS_MAX: f64 = 20.0;
 const LAG_SECS_PER_ROW: f64 = 3.0;
 
+/// Logs that a report names, of those that a robot has not enough of.
+const NAMED_MAX: usize = 3;
+
 /// Lengths of logs; `None` for those with two histories.
 type Logs = BTreeMap<FrameId, Option<u32>>;
 
@@ -49,14 +52,22 @@ impl Check for Converged {
         if logs.len() == digests.len() && old.is_some_and(|old| robots.iter().all(|robot| holds(&robot.logs, old))) {
             return Ok(());
         }
-        let of = |robot: &RobotSample| {
-            let status = robot.snapshot.as_ref().map(|s| (s.status.entries, s.status.pending));
-            let (entries, pending) = status.unwrap_or_default();
-            format!("{} {:?} ({entries} entries, {pending} pending)", robot.name, robot.digest)
-        };
-        let all: Vec<String> = robots.iter().map(of).collect();
+        let all: Vec<String> = robots.iter().map(|robot| state(robot, old)).collect();
         Err(format!("{} different sets: {}", digests.len(), all.join(", ")))
     }
+}
+
+/// What a robot holds, and how much of what it should have is missing.
+fn state(robot: &RobotSample, old: Option<&Logs>) -> String {
+    let status = robot.snapshot.as_ref().map(|s| (s.status.entries, s.status.pending));
+    let (entries, pending) = status.unwrap_or_default();
+    let late = old.into_iter().flatten().filter(|(frame, old)| !reaches(&robot.logs, **frame, **old));
+    let late: Vec<String> = late
+        .take(NAMED_MAX)
+        .map(|(frame, old)| format!("{frame} has {:?} of {old:?}", robot.logs.get(frame).copied().flatten()))
+        .collect();
+    let late = if late.is_empty() { String::new() } else { format!(", late: {}", late.join("; ")) };
+    format!("{} {:?} ({entries} entries, {pending} pending{late})", robot.name, robot.digest)
 }
 
 fn lag(robots: usize) -> Duration {
@@ -75,12 +86,17 @@ fn all_logs(robots: &[RobotSample]) -> Logs {
 }
 
 fn holds(logs: &Logs, old: &Logs) -> bool {
-    old.iter().all(|(frame, old)| match (logs.get(frame), old) {
+    old.iter().all(|(frame, old)| reaches(logs, *frame, *old))
+}
+
+/// Whether these logs hold so much of one log, or know of its two histories.
+fn reaches(logs: &Logs, frame: FrameId, old: Option<u32>) -> bool {
+    match (logs.get(&frame), old) {
         (Some(None), _) => true,
-        (Some(Some(len)), Some(old)) => len >= old,
-        (None, Some(old)) => *old == 0,
+        (Some(Some(len)), Some(old)) => *len >= old,
+        (None, Some(old)) => old == 0,
         (_, None) => false,
-    })
+    }
 }
 
 #[cfg(test)]

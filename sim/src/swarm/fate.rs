@@ -271,13 +271,9 @@ impl<C: Core> Swarm<C> {
     }
 
     fn block(&mut self, now: Instant, fault: &Fault, blocked: bool) {
-        let n = self.robots.len();
-        for from in 0..n {
-            for to in 0..n {
-                if from != to && fault.severs(self.robots[from].name.as_str(), self.robots[to].name.as_str()) {
-                    self.network.block(from, to, blocked);
-                }
-            }
+        let names: Vec<&str> = self.robots.iter().map(|robot| robot.name.as_str()).collect();
+        for (from, to) in fault.severed(&names) {
+            self.network.block(from, to, blocked);
         }
         self.update_hearing(now);
     }

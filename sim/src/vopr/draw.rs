@@ -16,13 +16,17 @@ const ROW_SECS: f64 = 3.0;
 /// More robots than this are a crowd: not all are in reach of all, and faults come in rounds, one for so many robots.
 const CROWD: usize = 10;
 const ROUNDS_MAX: usize = 10;
+/// In a swarm larger than this, robots write less each, the more of them there are: everybody checks everybody's
+/// signatures, and what many do at once is to be attacked, not what they write.
+const TALKATIVE: usize = 100;
 /// Share of the crowds that drive about; the others stand on a grid.
 const MOVING_SHARE: f64 = 0.5;
 /// How many a robot that drives about has in reach, on average.
 const IN_REACH: f64 = 12.0;
 /// Share of the runs in which robots also align, merge and solve.
 const SOLVE_SHARE: f64 = 0.15;
-/// Share of the runs in which robots may send little, and how little, B/s.
+/// Share of the runs in which robots may send little, and how little, B/s; in a crowd as much more as there are more of
+/// them, for everybody's facts cross every link, and within the stated time they must be able to.
 const SLOW_LINK_SHARE: f64 = 0.25;
 const SLOW_LINK: [f64; 2] = [4_000.0, 40_000.0];
 /// Faults begin after this, s: robots boot first.
@@ -52,14 +56,14 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
             walls_per_100m2: 0.0,
             ..WorldOptions::default()
         },
-        drive: DriveOptions { keyframe_m: dice.range(1.0, 3.0), ..DriveOptions::default() },
+        drive: DriveOptions { keyframe_m: sparsity(robots) * dice.range(1.0, 3.0), ..DriveOptions::default() },
         sensor: crate::world::sensor::SensorOptions::default(),
         summary: None,
         radio: radio(robots, &mut Dice::new(seed, "vopr radio")),
         network: network(&mut Dice::new(seed, "vopr network")),
         machine: machine(&mut Dice::new(seed, "vopr machines")),
         expect: Expect::default(),
-        config: config(&mut Dice::new(seed, "vopr config")),
+        config: config(robots, &mut Dice::new(seed, "vopr config")),
         faults: Vec::new(),
     };
     scenario.machine.start_within_secs = scenario.machine.start_within_secs.min(0.3 * duration_secs);
@@ -67,6 +71,11 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
     scenario.summary = Some(SummaryOptions { solve, liars, ..SummaryOptions::default() });
     scenario.faults = faults(&scenario, seed, solve);
     scenario
+}
+
+/// By how much keyframes lie farther apart than among few robots.
+fn sparsity(robots: usize) -> f64 {
+    libm::sqrt(robots.max(TALKATIVE) as f64 / TALKATIVE as f64)
 }
 
 fn radio(robots: usize, dice: &mut Dice) -> Layout {
@@ -118,7 +127,7 @@ fn machine(dice: &mut Dice) -> MachineOptions {
     }
 }
 
-fn config(dice: &mut Dice) -> Config {
+fn config(robots: usize, dice: &mut Dice) -> Config {
     let mut config = Config::default();
     config.submap.voxel_m = 0.4;
     config.submap.keyframes_max = 3 + dice.bits() as u32 % 3;
@@ -136,7 +145,7 @@ fn config(dice: &mut Dice) -> Config {
     config.gossip.delta_bytes_max = 4096 + dice.bits() as usize % (60 * 1024);
     let (slow, bytes_per_sec) = (dice.chance(SLOW_LINK_SHARE), dice.range(SLOW_LINK[0], SLOW_LINK[1]));
     if slow {
-        config.gossip.link_bytes_per_sec = bytes_per_sec;
+        config.gossip.link_bytes_per_sec = bytes_per_sec * robots.max(CROWD) as f64 / CROWD as f64;
     }
     config
 }
