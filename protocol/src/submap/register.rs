@@ -18,6 +18,7 @@ use super::hypotheses::hypotheses;
 use super::matching::pair_up;
 use super::refine::{RefineConfig, RefineError, Refined, refine_anchored};
 use super::scene::{Cloud, Pose, Scene};
+use super::summary::VOXEL_RATIO_MAX;
 use crate::align::{AlignError, Problem, SolverConfig, align};
 use crate::geometry::{Se3, So3};
 use nalgebra::Vector3;
@@ -27,12 +28,10 @@ use thiserror::Error;
 /// From natural to base-10 logarithms.
 const LOG10: f64 = core::f64::consts::LOG10_E;
 
-/// Clouds thinned to voxels that differ by more than this factor are not compared.
-pub(super) const VOXEL_RATIO_MAX: f64 = 1.5;
 /// Largest standard deviation of a rotation, rad: a covariance speaks of the neighbourhood in which rotations add up.
 const ROTATION_SIGMA_MAX: f64 = 0.25;
 /// Share of keypoints that may lie in one half-voxel cell with another: of a thinned cloud's hardly any do.
-pub(super) const CROWDED_MAX: f64 = 0.1;
+const CROWDED_MAX: f64 = 0.1;
 
 /// When an alignment is refused.
 #[derive(Clone, Debug, PartialEq)]
@@ -136,15 +135,8 @@ pub enum RegisterError {
 /// # Errors
 /// [`RegisterError`]: a refusal with its reason, or a solver setting out of range.
 pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) -> Result<Registered, RegisterError> {
+    check_comparable(theirs, mine)?;
     let voxel = mine.voxel();
-    let ratio = theirs.voxel() / voxel;
-    if !(1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio) {
-        return Err(RegisterError::Thinning { ratio });
-    }
-    let crowded = crowded(theirs);
-    if crowded > CROWDED_MAX {
-        return Err(RegisterError::Crowded { share: crowded });
-    }
     let their_cloud = cloud(in_voxels(&theirs.0), theirs.voxel() / voxel);
     let my_cloud = cloud(in_voxels(&mine.block), 1.0);
     let my_points: Vec<Vector3<f64>> = my_cloud.points.iter().map(|p| p * voxel).collect();
@@ -208,8 +200,18 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     })
 }
 
+/// Refuses keypoints of another thinning than mine, and those that are not thinned at all.
+pub(super) fn check_comparable(theirs: &Keypoints, mine: &Features) -> Result<(), RegisterError> {
+    let ratio = theirs.voxel() / mine.voxel();
+    if !(1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio) {
+        return Err(RegisterError::Thinning { ratio });
+    }
+    let share = crowded(theirs);
+    if share > CROWDED_MAX { Err(RegisterError::Crowded { share }) } else { Ok(()) }
+}
+
 /// Share of the keypoints in a half-voxel cell with another.
-pub(super) fn crowded(theirs: &Keypoints) -> f64 {
+fn crowded(theirs: &Keypoints) -> f64 {
     let cell = 0.5 * theirs.voxel();
     let cells: BTreeSet<[i64; 3]> =
         theirs.surfels().iter().map(|s| [0, 1, 2].map(|k| (s.position[k] / cell).floor() as i64)).collect();

@@ -27,8 +27,8 @@ const HEADER_LEN: usize = 6;
 const LEN: usize = HEADER_LEN + WORDS;
 /// Accepted voxel edges, frame units.
 const VOXEL_RANGE: core::ops::RangeInclusive<f32> = 1e-4..=1e3;
-/// Summaries of clouds thinned to voxels that differ by more than this factor describe different things.
-const VOXEL_RATIO_MAX: f64 = 1.5;
+/// Clouds thinned to voxels that differ by more than this factor are not compared, nor their summaries.
+pub(super) const VOXEL_RATIO_MAX: f64 = 1.5;
 
 /// Keeps a pair that is just alike enough from being passed over for a rounding error.
 const ROUNDING: f64 = 1.0 - 1e-9;

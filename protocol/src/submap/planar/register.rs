@@ -4,7 +4,7 @@ use super::super::block::{Stored, Surfel};
 use super::super::descriptor::PACKED_LEN;
 use super::super::features::{Features, Keypoints, UNSEEN};
 use super::super::refine::{RefineError, Refined};
-use super::super::register::{CROWDED_MAX, RegisterError, Registered, VOXEL_RATIO_MAX, crowded};
+use super::super::register::{RegisterError, Registered, check_comparable};
 use super::OUT_OF_PLANE_ALIGNED;
 use super::chart::{Beam, CELLS_MAX, Chart, EDGE};
 use super::court::{ALIKE, Court, Judged};
@@ -59,15 +59,8 @@ impl Default for FlatConfig {
 /// # Errors
 /// [`RegisterError`]: a refusal with its reason.
 pub fn register(theirs: &Keypoints, mine: &Features, config: &FlatConfig) -> Result<Registered, RegisterError> {
+    check_comparable(theirs, mine)?;
     let voxel = mine.voxel();
-    let ratio = theirs.voxel() / voxel;
-    if !(1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio) {
-        return Err(RegisterError::Thinning { ratio });
-    }
-    let crowded = crowded(theirs);
-    if crowded > CROWDED_MAX {
-        return Err(RegisterError::Crowded { share: crowded });
-    }
     let (their_surfels, my_surfels) = (theirs.surfels(), mine.surfels());
     if !their_surfels.iter().chain(&my_surfels).all(|s| s.position.z == 0.0) {
         return Err(RegisterError::NotPlanar);
