@@ -50,7 +50,7 @@ pub struct FlatConfig {
 
 impl Default for FlatConfig {
     fn default() -> Self {
-        Self { score_min: 38.0, fit_min: 0.3, contradiction_max: 0.13, rival_ratio: 0.7 }
+        Self { score_min: 38.0, fit_min: 0.3, contradiction_max: 0.1, rival_ratio: 0.55 }
     }
 }
 

@@ -48,7 +48,8 @@ pub(super) fn indexed_matrix(line: &str) -> anyhow::Result<(usize, Se3)> {
     Ok((v[0] as usize, Se3::from_matrix(&Matrix4::from_row_slice(&v[1..]))))
 }
 
-fn numbers(line: &str) -> anyhow::Result<Vec<f64>> {
+/// The numbers of a line, between white space.
+pub(super) fn numbers(line: &str) -> anyhow::Result<Vec<f64>> {
     line.split_whitespace().map(|word| word.parse().with_context(|| format!("{word:?} is no number"))).collect()
 }
 

@@ -3,13 +3,17 @@
 use super::sets::{Place, Set};
 use crate::bench::cpu::thread_seconds;
 use merganser_protocol::align::SolverConfig;
+use merganser_protocol::config::Sensor;
 use merganser_protocol::geometry::Se3;
+use merganser_protocol::submap::planar::{self, FlatConfig};
 use merganser_protocol::submap::{Features, RegisterConfig, RegisterError, Registered, register};
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 
-/// Voxels within which a point counts as seen by the other submap.
+/// Voxels within which a point counts as seen by the other submap...
 const NEAR_VOXELS: f64 = 1.5;
+/// ...and where the truth itself is not good to a voxel, m.
+const NEAR_PLANAR_M: f64 = 0.2;
 /// From this share of seen points on a pair is to be found.
 pub(super) const OVERLAP_FOUND: f64 = 0.25;
 /// Below this share (of either submap) a pair has no overlap.
@@ -42,8 +46,9 @@ pub(super) struct Tried {
 pub(super) fn pairs(sets: &[Set]) -> Vec<(At, At)> {
     let all: Vec<At> = (0..sets.len()).flat_map(|s| (0..sets[s].places.len()).map(move |k| (s, k))).collect();
     let voxel = |at: At| place(sets, at).described.features.voxel();
+    let alike = |a: At, b: At| voxel(a) == voxel(b) && sets[a.0].sensor == sets[b.0].sensor;
     let ordered = all.iter().flat_map(|&a| all.iter().map(move |&b| (a, b)));
-    ordered.filter(|&(a, b)| a != b && voxel(a) == voxel(b)).collect()
+    ordered.filter(|&(a, b)| a != b && alike(a, b)).collect()
 }
 
 /// The submap at a position.
@@ -69,18 +74,24 @@ fn one(sets: &[Set], their: At, mine: At) -> anyhow::Result<Tried> {
     let truth = (their.0 == mine.0).then(|| ours.t_world_anchor.inverse() * theirs.t_world_anchor);
     // A copy that has not computed its descriptors yet: their time counts.
     let features = Features::decode(&ours.described.features.encode())?;
-    let sigma_max = NEAR_VOXELS * features.voxel();
-    let solver = SolverConfig { sigma_max, support_min: 8.0, seed: 7, ..Default::default() };
+    let near = NEAR_VOXELS * features.voxel();
+    let sensor = sets[their.0].sensor;
+    let radius = if sensor == Sensor::Laser2d { NEAR_PLANAR_M } else { near };
+    let solver = SolverConfig { sigma_max: near, support_min: 8.0, seed: 7, ..Default::default() };
     let config = RegisterConfig { solver, ..Default::default() };
     let start = thread_seconds();
-    let answer = register(&theirs.described.keypoints, &features, &config);
+    let keypoints = &theirs.described.keypoints;
+    let answer = match sensor {
+        Sensor::Laser2d => planar::register(keypoints, &features, &FlatConfig::default()),
+        Sensor::Points3d => register(keypoints, &features, &config),
+    };
     let seconds = thread_seconds() - start;
     let pose = answer.as_ref().ok().map(|found| &found.refined.pose);
     let error = pose.zip(truth).map(|(pose, truth)| difference(&pose.pose, &truth));
     let nees = pose.zip(truth).map(|(pose, truth)| pose.covariance.mahalanobis_squared(&pose.pose.local(&truth)));
     let rule = &sets[their.0];
     let is_right = error.is_some_and(|(deg, m)| deg < rule.rotation_deg && m < rule.translation_m);
-    let overlap = truth.map_or(0.0, |truth| overlap(theirs, ours, &truth));
+    let overlap = truth.map_or(0.0, |truth| overlap(theirs, ours, &truth, radius));
     Ok(Tried { their, mine, overlap, answer, error, is_right, nees, seconds })
 }
 
@@ -90,8 +101,7 @@ pub(super) fn difference(a: &Se3, b: &Se3) -> (f64, f64) {
 }
 
 /// Share of a's points with a point of b near them.
-fn overlap(a: &Place, b: &Place, t_b_a: &Se3) -> f64 {
-    let radius = NEAR_VOXELS * a.described.features.voxel();
+fn overlap(a: &Place, b: &Place, t_b_a: &Se3, radius: f64) -> f64 {
     let cell = |p: &Vector3<f64>| [p.x, p.y, p.z].map(|x| (x / radius).floor() as i64);
     let mut cells = BTreeMap::<[i64; 3], Vec<Vector3<f64>>>::new();
     for s in b.described.features.surfels() {

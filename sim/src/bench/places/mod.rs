@@ -1,8 +1,9 @@
 //! Seeing the same place on recorded data: alignments of submaps that overlap and of such that do not, candidates by
 //! their summaries, bytes and time, beside KISS-Matcher. The sets and rules are those the design was measured on: ten
 //! submaps of five depth images of one room (7-Scenes), five LiDAR scans along a street (KITTI 07), five of another
-//! (KITTI 00). Every submap starts in a frame of random orientation.
+//! (KITTI 00), each in a frame of random orientation; and the way of a planar laser through an office building (aces).
 
+mod aces;
 mod candidates;
 mod files;
 mod measure;
@@ -18,7 +19,7 @@ use std::path::PathBuf;
 /// What to measure.
 #[derive(Debug, Args)]
 pub struct Places {
-    /// Folder that holds rgbd_7scenes, lidar_gtsam_points, kitti00_scans and kitti_poses_lidar
+    /// Folder that holds rgbd_7scenes, lidar_gtsam_points, kitti00_scans, kitti_poses_lidar and lidar2d_radish
     #[arg(long, value_name = "DIR")]
     pub data: PathBuf,
     /// Keypoints sent one way: 332 are 7.0 kB
@@ -38,7 +39,8 @@ pub struct Places {
     pub peer_voxel: f64,
 }
 
-/// Measures and prints. Returns whether nothing wrong was accepted and as much was found as promised.
+/// Measures and prints. Returns whether as much was found as promised, and no more wrong accepted (nothing, but of the
+/// planar laser).
 ///
 /// # Errors
 /// Data or an interpreter that cannot be used.

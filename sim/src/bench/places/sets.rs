@@ -1,9 +1,9 @@
 //! The recorded sets as described submaps with true poses.
 
-use super::files;
+use super::{aces, files};
 use crate::bench::cpu::thread_seconds;
 use anyhow::Context;
-use merganser_protocol::config::SubmapConfig;
+use merganser_protocol::config::{Sensor, SubmapConfig};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::submap::{CovarianceOf, Described, Keyframe, Submap, SubmapBuilder, describe};
 use merganser_protocol::time::Stamp;
@@ -43,6 +43,8 @@ pub(super) struct Scan {
 pub(super) struct Set {
     /// Its name.
     pub name: &'static str,
+    /// What saw it.
+    pub sensor: Sensor,
     /// Its submaps.
     pub places: Vec<Place>,
     /// An alignment is right within this angle...
@@ -51,12 +53,15 @@ pub(super) struct Set {
     pub translation_m: f64,
     /// Directions to find at least, of those that overlap by a quarter.
     pub found_min: usize,
+    /// Wrong answers at most. A building with two halves alike is not told apart by one pair of submaps.
+    pub wrong_max: usize,
 }
 
 /// Loads all sets; each submap's body is turned at random.
 pub(super) fn load(data: &Path, keypoints: usize, seed: u64) -> anyhow::Result<Vec<Set>> {
     let mut maker = Maker { keypoints, rng: ChaCha8Rng::seed_from_u64(seed) };
-    Ok(vec![maker.seven_scenes(data)?, maker.kitti07(data)?, maker.kitti00(data)?])
+    let aces = aces::load(data, keypoints)?;
+    Ok(vec![maker.seven_scenes(data)?, maker.kitti07(data)?, maker.kitti00(data)?, aces])
 }
 
 struct Maker {
@@ -81,7 +86,15 @@ impl Maker {
             }
             places.push(self.place((first / 100).to_string(), 0.05, keyframes)?.0);
         }
-        Ok(Set { name: "7scenes", places, rotation_deg: 15.0, translation_m: 0.3, found_min: 76 })
+        Ok(Set {
+            name: "7scenes",
+            sensor: Sensor::Points3d,
+            places,
+            rotation_deg: 15.0,
+            translation_m: 0.3,
+            found_min: 76,
+            wrong_max: 0,
+        })
     }
 
     /// 5 scans, each a submap.
@@ -92,7 +105,15 @@ impl Maker {
             let (k, pose) = files::indexed_pose(line)?;
             places.push(self.scan(k.to_string(), pose, folder.join(format!("{k:06}/points.bin")), 3)?);
         }
-        Ok(Set { name: "kitti07", places, rotation_deg: 5.0, translation_m: 2.0, found_min: 17 })
+        Ok(Set {
+            name: "kitti07",
+            sensor: Sensor::Points3d,
+            places,
+            rotation_deg: 5.0,
+            translation_m: 2.0,
+            found_min: 17,
+            wrong_max: 0,
+        })
     }
 
     /// 5 scans of another street.
@@ -103,7 +124,15 @@ impl Maker {
             let (_, pose) = files::indexed_pose(text.lines().nth(k).context("kitti00.txt.xz is cut")?)?;
             places.push(self.scan(k.to_string(), pose, data.join(format!("kitti00_scans/{k:06}.bin")), 4)?);
         }
-        Ok(Set { name: "kitti00", places, rotation_deg: 5.0, translation_m: 2.0, found_min: 4 })
+        Ok(Set {
+            name: "kitti00",
+            sensor: Sensor::Points3d,
+            places,
+            rotation_deg: 5.0,
+            translation_m: 2.0,
+            found_min: 4,
+            wrong_max: 0,
+        })
     }
 
     fn scan(&mut self, name: String, pose: Se3, path: std::path::PathBuf, stride: usize) -> anyhow::Result<Place> {
