@@ -145,7 +145,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     if crowded > CROWDED_MAX {
         return Err(RegisterError::Crowded { share: crowded });
     }
-    let their_cloud = cloud(in_voxels(&theirs.0), theirs.voxel() / voxel);
+    let their_cloud = cloud(in_voxels(&theirs.block), theirs.voxel() / voxel);
     let my_cloud = cloud(in_voxels(&mine.block), 1.0);
     let my_points: Vec<Vector3<f64>> = my_cloud.points.iter().map(|p| p * voxel).collect();
     let pairings = pair_up(theirs, mine, &my_points);
