@@ -7,13 +7,22 @@
 //!  "covariance": [1e-4, 0, 0, 0, 0, 0,  1e-4, 0, 0, 0, 0,  1e-4, 0, 0, 0,  1e-6, 0, 0,  1e-6, 0,  1e-6],
 //!  "covariance_of": "motion", "points": [[1.5, 0.2, 0.0]]}
 //! ```
+//!
+//! Where points are landmarks (`submap.sensor = "landmarks"` or `"landmarks_2d"`), `landmarks` says of each point what else
+//! is known, in the points' order: the upper triangle of its covariance, row by row, and a label or a descriptor of 256 bits
+//! (32 bytes) or both. A message without `landmarks` (in postcard: one that ends with its points) has none.
+//!
+//! ```text
+//! "points": [[1.5, 0.2, 0.0]], "landmarks": [{"covariance": [1e-3, 0, 0, 1e-3, 0, 1e-3], "label": 72}]
+//! ```
 
 use merganser_protocol::agent::io::Sighting;
 use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::Name;
-use merganser_protocol::submap::{CovarianceOf, Keyframe};
+use merganser_protocol::submap::landmarks::Descriptor;
+use merganser_protocol::submap::{CovarianceOf, Keyframe, Mark};
 use merganser_protocol::time::Stamp;
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::{Matrix3, Matrix6, Vector3};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -40,6 +49,23 @@ pub struct KeyframeMessage {
     pub covariance_of: CovarianceOf,
     /// Points in the body frame.
     pub points: Vec<[f32; 3]>,
+    /// What else is known of each point, if these are landmarks; else none.
+    #[serde(default)]
+    pub landmarks: Vec<LandmarkMessage>,
+}
+
+/// What is known of a landmark besides its place.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LandmarkMessage {
+    /// Upper triangle, row by row, of the covariance of its place in the body frame, m² (frame units squared).
+    pub covariance: [f64; 6],
+    /// Who it is; equal labels are one landmark.
+    #[serde(default)]
+    pub label: Option<u32>,
+    /// What it looks like: 256 bits, compared by how many differ.
+    #[serde(default)]
+    pub descriptor: Option<Descriptor>,
 }
 
 /// A sighting as it travels.
@@ -88,6 +114,22 @@ pub enum ObservationError {
     /// The covariance is none.
     #[error("{0}")]
     Covariance(#[from] CovarianceError),
+    /// Not one landmark for each point.
+    #[error("{landmarks} landmarks for {points} points; state what is known of each point, or of none")]
+    Landmarks {
+        /// Points.
+        points: usize,
+        /// Landmarks.
+        landmarks: usize,
+    },
+    /// The covariance of a landmark is none.
+    #[error("landmark {index} (counted from 0): {error}")]
+    LandmarkCovariance {
+        /// Which.
+        index: usize,
+        /// What is wrong with it.
+        error: CovarianceError,
+    },
     /// Too many points.
     #[error("{0} points; send at most {POINTS_MAX}, thinned if need be")]
     Points(usize),
@@ -98,7 +140,16 @@ pub enum ObservationError {
 /// # Errors
 /// [`ObservationError`].
 pub fn keyframe(format: Format, bytes: &[u8]) -> Result<Keyframe, ObservationError> {
-    Keyframe::try_from(decode::<KeyframeMessage>(format, bytes)?)
+    let message = match format {
+        Format::Json => decode::<KeyframeMessage>(format, bytes),
+        // A message that ends with its points goes on with no landmarks; to one that is complete, a byte is left over.
+        Format::Postcard => match postcard::take_from_bytes(&[bytes, &[0]].concat()) {
+            Ok((value, [] | [0])) => Ok(value),
+            Ok((_, rest)) => Err(ObservationError::Trailing(rest.len() - 1)),
+            Err(e) => Err(ObservationError::Postcard(e.to_string())),
+        },
+    };
+    Keyframe::try_from(message?)
 }
 
 /// Decodes and checks a sighting.
@@ -130,8 +181,31 @@ impl TryFrom<KeyframeMessage> for Keyframe {
         if !message.points.iter().flatten().all(|&x| sane(f64::from(x))) {
             return Err(ObservationError::Number("points"));
         }
+        let (points, landmarks) = (message.points.len(), message.landmarks.len());
+        if landmarks != 0 && landmarks != points {
+            return Err(ObservationError::Landmarks { points, landmarks });
+        }
+        let mark = |(index, landmark): (usize, &LandmarkMessage)| {
+            mark(landmark).map_err(|error| ObservationError::LandmarkCovariance { index, error })
+        };
+        let marks = message.landmarks.iter().enumerate().map(mark).collect::<Result<_, _>>()?;
         let stamp = Stamp(message.stamp_ns);
-        Ok(Self { stamp, pose, covariance_of: message.covariance_of, points: message.points })
+        Ok(Self { stamp, pose, covariance_of: message.covariance_of, points: message.points, marks })
+    }
+}
+
+/// Checks what is known of a landmark.
+fn mark(landmark: &LandmarkMessage) -> Result<Mark, CovarianceError> {
+    let [xx, xy, xz, yy, yz, zz] = landmark.covariance;
+    let covariance = Covariance::new(Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz))?;
+    Ok(Mark { covariance, label: landmark.label, descriptor: landmark.descriptor })
+}
+
+impl From<&Mark> for LandmarkMessage {
+    fn from(mark: &Mark) -> Self {
+        let m = mark.covariance.matrix();
+        let covariance = [m[(0, 0)], m[(0, 1)], m[(0, 2)], m[(1, 1)], m[(1, 2)], m[(2, 2)]];
+        Self { covariance, label: mark.label, descriptor: mark.descriptor }
     }
 }
 
@@ -145,6 +219,7 @@ impl From<&Keyframe> for KeyframeMessage {
             covariance: upper_triangle(covariance),
             covariance_of: keyframe.covariance_of,
             points: keyframe.points.clone(),
+            landmarks: keyframe.marks.iter().map(Into::into).collect(),
         }
     }
 }
@@ -215,7 +290,53 @@ mod tests {
             covariance,
             covariance_of: CovarianceOf::Pose,
             points: vec![[1.0, 2.0, 3.0], [-1.0, 0.5, 0.25]],
+            landmarks: vec![],
         }
+    }
+
+    fn of_landmarks() -> KeyframeMessage {
+        let covariance = [0.01, 0.001, 0.0, 0.02, 0.0, 0.03];
+        let named = LandmarkMessage { covariance, label: Some(72), descriptor: None };
+        let described = LandmarkMessage { covariance, label: None, descriptor: Some([7; 32]) };
+        KeyframeMessage { landmarks: vec![named, described], ..message() }
+    }
+
+    #[test]
+    fn landmarks_travel_with_their_points() {
+        let json = serde_json::to_vec(&of_landmarks()).unwrap();
+        let postcard = postcard::to_stdvec(&of_landmarks()).unwrap();
+        let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+        assert_eq!(a, b);
+        assert_eq!((a.marks[0].label, a.marks[1].descriptor), (Some(72), Some([7; 32])));
+        assert_eq!(KeyframeMessage::from(&a).landmarks, of_landmarks().landmarks);
+        // What was sent before there were landmarks ends with its points.
+        let plain = postcard::to_stdvec(&message()).unwrap();
+        let (earlier, none) = plain.split_at(plain.len() - 1);
+        assert_eq!(none, [0]);
+        assert_eq!(keyframe(Format::Postcard, earlier).unwrap(), keyframe(Format::Postcard, &plain).unwrap());
+        for len in 0..earlier.len() {
+            assert!(keyframe(Format::Postcard, &earlier[..len]).is_err(), "cut to {len}");
+        }
+        for extra in [&[0][..], &[0, 0], &[1]] {
+            let longer = [&plain[..], extra].concat();
+            assert_eq!(keyframe(Format::Postcard, &longer), Err(ObservationError::Trailing(extra.len())));
+        }
+    }
+
+    #[test]
+    fn landmarks_that_do_not_fit_are_refused() {
+        let told = |change: &dyn Fn(&mut KeyframeMessage)| {
+            let mut message = of_landmarks();
+            change(&mut message);
+            Keyframe::try_from(message).map(drop)
+        };
+        assert_eq!(told(&|_| ()), Ok(()));
+        assert_eq!(told(&|m| drop(m.landmarks.pop())), Err(ObservationError::Landmarks { points: 2, landmarks: 1 }));
+        let error = CovarianceError::NotPositiveDefinite;
+        let refused = ObservationError::LandmarkCovariance { index: 1, error };
+        assert_eq!(told(&|m| m.landmarks[1].covariance[1] = 0.5), Err(refused));
+        let refused = ObservationError::LandmarkCovariance { index: 0, error: CovarianceError::NotFinite };
+        assert_eq!(told(&|m| m.landmarks[0].covariance[5] = f64::NAN), Err(refused));
     }
 
     #[test]

@@ -28,7 +28,7 @@ pub struct SubmapConfig {
     /// What makes the points.
     pub sensor: Sensor,
     /// Edge of the thinning voxel. Choose the sensor's noise times three or so: 0.05 for depth cameras, 0.5 for
-    /// spinning LiDAR outdoors.
+    /// spinning LiDAR outdoors. Landmarks are not thinned, but it is the unit of their noise, too.
     pub voxel_m: f64,
     /// A submap ends after the robot moved this far...
     pub distance_m: f64,
@@ -74,6 +74,26 @@ pub enum Sensor {
     /// sharpened by scan matching, and nothing is claimed to be known of height and tilt.
     #[serde(rename = "laser_2d")]
     Laser2d,
+    /// Landmarks in space, as a visual SLAM keeps them: few, each with a covariance, and known by a label or a
+    /// descriptor.
+    #[serde(rename = "landmarks")]
+    Landmarks,
+    /// Landmarks on the plane in which the robot drives, such as range and bearing give them. Poses are taken as planar,
+    /// heights are left out, and nothing is claimed to be known of height and tilt.
+    #[serde(rename = "landmarks_2d")]
+    Landmarks2d,
+}
+
+impl Sensor {
+    /// Whether poses have three degrees of freedom.
+    pub fn is_planar(self) -> bool {
+        matches!(self, Self::Laser2d | Self::Landmarks2d)
+    }
+
+    /// Whether points are landmarks.
+    pub fn sees_landmarks(self) -> bool {
+        matches!(self, Self::Landmarks | Self::Landmarks2d)
+    }
 }
 
 /// How two submaps are aligned.
@@ -85,7 +105,8 @@ pub struct AlignConfig {
     pub sigma_max_voxels: f64,
     /// An alignment needs log₁₀ NFA below this.
     pub log10_nfa_max: f64,
-    /// ...where a scale is unknown, at least this support (sum of inlier probabilities; elsewhere clouds judge)...
+    /// ...where a scale is unknown, or of landmarks in space, at least this support (sum of inlier probabilities; elsewhere
+    /// clouds judge)...
     pub support_min: f64,
     /// ...and at least this share of keypoints with a counterpart in the other cloud.
     pub fit_min: f64,

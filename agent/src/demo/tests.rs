@@ -358,7 +358,7 @@ fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             let pose = PoseWithCovariance { pose: track.odometry[index], covariance: covariance() };
             let stamp = Stamp((track.stamps_secs[index] * 1e9) as i64);
             let covariance_of = CovarianceOf::Motion;
-            writer.push(&Keyframe { stamp, pose, covariance_of, points }, Some(truth)).unwrap();
+            writer.push(&Keyframe { stamp, pose, covariance_of, points, marks: vec![] }, Some(truth)).unwrap();
         }
         writer.finish().unwrap();
     }

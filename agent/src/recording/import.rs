@@ -162,7 +162,8 @@ impl Cut<'_> {
             let mut writer = Writer::create(&folder, self.manifest(name).map_err(|problem| problem.of(&folder))?)?;
             for (scan, pose) in part.iter().zip(odometry) {
                 let covariance_of = CovarianceOf::Motion;
-                let keyframe = Keyframe { stamp: scan.stamp, pose, covariance_of, points: points(scan)? };
+                let keyframe =
+                    Keyframe { stamp: scan.stamp, pose, covariance_of, points: points(scan)?, marks: vec![] };
                 writer.push(&keyframe, Some(&scan.truth))?;
             }
             writer.finish()?;

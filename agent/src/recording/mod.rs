@@ -11,6 +11,7 @@ pub mod import;
 mod import_laser;
 mod import_lidar;
 mod import_rgbd;
+mod landmarks;
 mod pcd;
 pub mod ply;
 mod table;
@@ -72,7 +73,7 @@ impl Recording {
     /// # Errors
     /// [`RecordingError`] for the first.
     pub fn check_clouds(&self) -> Result<(), RecordingError> {
-        (0..self.len()).try_for_each(|index| self.points(index).map(drop))
+        (0..self.len()).try_for_each(|index| self.keyframe(index).map(drop))
     }
 
     /// Where it lies.
@@ -126,7 +127,12 @@ impl Recording {
         let points = self.points(index)?;
         let line = self.line(index)?;
         let covariance_of = self.manifest.covariance_of;
-        Ok(Keyframe { stamp: line.stamp, pose: line.pose, covariance_of, points })
+        let marks = if self.manifest.config.submap.sensor.sees_landmarks() {
+            landmarks::read(&self.folder.join(&line.cloud), self.manifest.clouds)?
+        } else {
+            Vec::new()
+        };
+        Ok(Keyframe { stamp: line.stamp, pose: line.pose, covariance_of, points, marks })
     }
 
     fn line(&self, index: usize) -> Result<&KeyframeLine, RecordingError> {

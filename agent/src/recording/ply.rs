@@ -11,17 +11,27 @@ const HEADER_LINES_MAX: usize = 1000;
 /// How one scalar is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Scalar {
-    Int(usize),
+    Int(usize, Sign),
     F32,
     F64,
+}
+
+/// Whether an integer may be negative.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Sign {
+    Signed,
+    Unsigned,
 }
 
 impl Scalar {
     fn parse(text: &str) -> Option<Self> {
         Some(match text {
-            "char" | "uchar" | "int8" | "uint8" => Self::Int(1),
-            "short" | "ushort" | "int16" | "uint16" => Self::Int(2),
-            "int" | "uint" | "int32" | "uint32" => Self::Int(4),
+            "char" | "int8" => Self::Int(1, Sign::Signed),
+            "uchar" | "uint8" => Self::Int(1, Sign::Unsigned),
+            "short" | "int16" => Self::Int(2, Sign::Signed),
+            "ushort" | "uint16" => Self::Int(2, Sign::Unsigned),
+            "int" | "int32" => Self::Int(4, Sign::Signed),
+            "uint" | "uint32" => Self::Int(4, Sign::Unsigned),
             "float" | "float32" => Self::F32,
             "double" | "float64" => Self::F64,
             _ => return None,
@@ -30,9 +40,24 @@ impl Scalar {
 
     fn bytes(self) -> usize {
         match self {
-            Self::Int(bytes) => bytes,
+            Self::Int(bytes, _) => bytes,
             Self::F32 => 4,
             Self::F64 => 8,
+        }
+    }
+
+    /// The value of its bytes, little-endian.
+    fn value(self, bytes: &[u8]) -> f64 {
+        match (self, bytes) {
+            (Self::F32, &[a, b, c, d]) => f64::from(f32::from_le_bytes([a, b, c, d])),
+            (Self::F64, &[a, b, c, d, e, f, g, h]) => f64::from_le_bytes([a, b, c, d, e, f, g, h]),
+            (Self::Int(_, Sign::Signed), &[a]) => f64::from(a.cast_signed()),
+            (Self::Int(_, Sign::Signed), &[a, b]) => f64::from(i16::from_le_bytes([a, b])),
+            (Self::Int(_, Sign::Signed), &[a, b, c, d]) => f64::from(i32::from_le_bytes([a, b, c, d])),
+            (Self::Int(_, Sign::Unsigned), &[a]) => f64::from(a),
+            (Self::Int(_, Sign::Unsigned), &[a, b]) => f64::from(u16::from_le_bytes([a, b])),
+            (Self::Int(_, Sign::Unsigned), &[a, b, c, d]) => f64::from(u32::from_le_bytes([a, b, c, d])),
+            _ => f64::NAN,
         }
     }
 }
@@ -123,7 +148,8 @@ impl Header {
     fn axes(&self) -> Result<[usize; 3], Problem> {
         let mut axes = [0; 3];
         for (axis, name) in axes.iter_mut().zip(["x", "y", "z"]) {
-            let is_axis = |(property, scalar): &(String, Scalar)| property == name && !matches!(scalar, Scalar::Int(_));
+            let is_axis =
+                |(property, scalar): &(String, Scalar)| property == name && !matches!(scalar, Scalar::Int(..));
             *axis =
                 self.properties.iter().position(is_axis).ok_or_else(|| {
                     Problem::Ply(format!("the vertices have no property {name} of type float or double"))
@@ -176,6 +202,33 @@ fn ascii(header: &Header, body: &[u8]) -> Result<Vec<[f32; 3]>, Fault> {
     Ok(points)
 }
 
+/// The values of the named properties, vertex by vertex; of those that the vertices do not have, `None`. The file is one
+/// that [`parse`] reads.
+pub(super) fn columns(bytes: &[u8], names: &[&str]) -> Result<Vec<Option<Vec<f64>>>, Fault> {
+    let header = header(bytes)?;
+    let body = &bytes[header.body..];
+    let words: Vec<Vec<&str>> = if header.binary {
+        Vec::new()
+    } else {
+        let line = |line| str::from_utf8(line).unwrap_or_default().split_ascii_whitespace().collect();
+        body.split(|b| *b == b'\n').take(header.vertices).map(line).collect()
+    };
+    let offset = |property: usize| header.properties[..property].iter().map(|(_, s)| s.bytes()).sum::<usize>();
+    let record = offset(header.properties.len()).max(1);
+    let column = |name: &&str| -> Option<Vec<f64>> {
+        let property = header.properties.iter().position(|(property, _)| property == name)?;
+        let (begin, scalar) = (offset(property), header.properties[property].1);
+        let in_record = |bytes: &[u8]| bytes.get(begin..begin + scalar.bytes()).map_or(f64::NAN, |b| scalar.value(b));
+        let in_line = |words: &Vec<&str>| words.get(property).and_then(|word| word.parse().ok()).unwrap_or(f64::NAN);
+        Some(if header.binary {
+            body.chunks_exact(record).take(header.vertices).map(in_record).collect()
+        } else {
+            words.iter().map(in_line).collect()
+        })
+    };
+    Ok(names.iter().map(column).collect())
+}
+
 /// A binary little-endian PLY of x, y, z as floats.
 pub(super) fn encode(points: &[[f32; 3]]) -> Vec<u8> {
     let mut bytes = head(points.len(), "");
@@ -189,6 +242,16 @@ pub fn encode_coloured<'a>(count: usize, points: impl Iterator<Item = (&'a [f32;
     for (point, colour) in points {
         bytes.extend(point.iter().flat_map(|c| c.to_le_bytes()));
         bytes.extend(colour);
+    }
+    bytes
+}
+
+/// A binary little-endian PLY of x, y, z as floats and further properties, whose values are `more`, vertex by vertex.
+pub(super) fn encode_with(points: &[[f32; 3]], properties: &str, more: impl Iterator<Item = Vec<u8>>) -> Vec<u8> {
+    let mut bytes = head(points.len(), properties);
+    for (point, more) in points.iter().zip(more) {
+        bytes.extend(point.iter().flat_map(|c| c.to_le_bytes()));
+        bytes.extend(more);
     }
     bytes
 }

@@ -31,7 +31,13 @@ fn write_good(folder: &Path, robot: &str) {
         m[(5, 0)] = 1e-3;
         let pose = PoseWithCovariance { pose, covariance: Covariance::new(m).unwrap() };
         let points = vec![[1.0, 2.0, 3.0 + i as f32]; 3];
-        let keyframe = Keyframe { stamp: Stamp(1000 + i64::from(i)), pose, covariance_of: CovarianceOf::Pose, points };
+        let keyframe = Keyframe {
+            stamp: Stamp(1000 + i64::from(i)),
+            pose,
+            covariance_of: CovarianceOf::Pose,
+            points,
+            marks: vec![],
+        };
         writer.push(&keyframe, Some(&pose.pose.inverse())).unwrap();
     }
     writer.finish().unwrap();

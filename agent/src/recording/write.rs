@@ -3,6 +3,7 @@
 
 use super::cloud;
 use super::error::{Problem, RecordingError, on};
+use super::landmarks;
 use super::{KEYFRAMES, MANIFEST, TRUTH};
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::recording::{FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION};
@@ -44,7 +45,12 @@ impl Writer {
         let format = self.manifest.clouds;
         let cloud = format!("{CLOUDS}/{:06}.{}", self.manifest.keyframes, cloud::extension(format));
         let path = self.folder.join(&cloud);
-        let bytes = cloud::encode(&keyframe.points, format).map_err(|problem| problem.of(&path))?;
+        let bytes = if keyframe.marks.is_empty() {
+            cloud::encode(&keyframe.points, format)
+        } else {
+            landmarks::encode(&keyframe.points, &keyframe.marks)
+        };
+        let bytes = bytes.map_err(|problem| problem.of(&path))?;
         on(&path, fs::write(&path, bytes))?;
         line(&mut self.keyframes, keyframe.stamp.0, &keyframe.pose.pose);
         let p = keyframe.pose.covariance.matrix();

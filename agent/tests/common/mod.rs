@@ -163,5 +163,6 @@ pub fn keyframe(robot: u64, index: u64) -> Keyframe {
         pose: PoseWithCovariance { pose: t_room_body, covariance },
         covariance_of: CovarianceOf::Motion,
         points: points.collect(),
+        marks: Vec::new(),
     }
 }

@@ -7,6 +7,7 @@ use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEsti
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
+use crate::submap::landmarks::{self, LandmarkConfig};
 use crate::submap::planar::FlatConfig;
 use crate::submap::{
     self, Described, Features, Keypoints, RefineError, RegisterConfig, RegisterError, Registered, Submap,
@@ -187,10 +188,20 @@ impl AlignJob {
             (Sensor::Laser2d, ScaleKind::Metric) => {
                 self.measured(submap::planar::register(&self.theirs, &self.mine, &FlatConfig::default()))
             }
-            (Sensor::Laser2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput),
+            // In the plane nobody tells a scale.
+            (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput),
+            (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(true),
+            (Sensor::Landmarks, _) => self.landmarks(false),
             (Sensor::Points3d, ScaleKind::Metric) => self.register(),
             (Sensor::Points3d, ScaleKind::Unknown) => self.align(),
         }
+    }
+
+    fn landmarks(&self, planar: bool) -> Result<Measured, RefusalReason> {
+        let config = LandmarkConfig { planar, solver: self.solver() };
+        let found = landmarks::register(&self.theirs, &self.mine, &config).map_err(|e| RefusalReason::from(&e))?;
+        let landmarks::Aligned { t_mine_theirs, sigma, support, log10_nfa } = found;
+        Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
     }
 
     fn register(&self) -> Result<Measured, RefusalReason> {

@@ -10,10 +10,11 @@
 //! the stated one is up to a sixth too small, even with w/3 added to every alignment). Only the first anchor needs
 //! care: see [`FIRST_CLOUD_SHARE`].
 
+use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
 use super::odometry::{across_gap_after, isotropic, motion};
-use super::planar::{Sharpener, TILT_MAX, flat};
+use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
 use super::thinning::Thinner;
-use super::{Keyframe, PoseWithCovariance};
+use super::{Keyframe, Mark, PoseWithCovariance};
 use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
@@ -54,6 +55,8 @@ pub struct Submap {
     pub cloud: Vec<[f32; 3]>,
     /// For each point the position (in `keyframes`) of the keyframe that saw it first.
     pub seen_from: Vec<u16>,
+    /// Of landmarks: the points once more, and what else is known of them. Empty where points lie on surfaces.
+    pub constellation: Constellation,
 }
 
 /// Why a keyframe was refused. The builder is as it was before; only the odometry across the refused keyframe becomes
@@ -86,6 +89,25 @@ pub enum KeyframeError {
     /// A coordinate of a point is NaN or infinite.
     #[error("point {index} of the keyframe is not finite; leave out invalid returns")]
     PointNotFinite {
+        /// Position in the keyframe's points.
+        index: usize,
+    },
+    /// Landmarks without marks, or marks of what are no landmarks.
+    #[error(
+        "keyframe has {points} points and {marks} marks; with submap.sensor = \"landmarks\" or \"landmarks_2d\" send a \
+         mark for each point, else none"
+    )]
+    Marks {
+        /// Points.
+        points: usize,
+        /// Marks.
+        marks: usize,
+    },
+    /// A landmark's covariance is out of range.
+    #[error(
+        "landmark {index} has a standard deviation outside 1e-6 to 1e4; state its covariance in frame units squared"
+    )]
+    MarkOutOfRange {
         /// Position in the keyframe's points.
         index: usize,
     },
@@ -136,6 +158,7 @@ struct Open {
     keyframes: Vec<Se3>,
     /// About the first body pose, until it is known which is the middle one.
     cloud: Thinner,
+    landmarks: Gatherer,
 }
 
 impl SubmapBuilder {
@@ -176,12 +199,12 @@ impl SubmapBuilder {
         let step = self.step(&keyframe);
         self.t_frame_body = match (&step, self.config.sensor) {
             (Some(step), Sensor::Laser2d) => self.t_frame_body * step.pose,
-            (None, Sensor::Laser2d) => flat(&keyframe.pose.pose),
-            (_, Sensor::Points3d) => keyframe.pose.pose,
+            (None, Sensor::Laser2d) | (_, Sensor::Landmarks2d) => flat(&keyframe.pose.pose),
+            (_, Sensor::Points3d | Sensor::Landmarks) => keyframe.pose.pose,
         };
         self.track(&keyframe, step);
         self.extend(&keyframe);
-        self.last = Some(Keyframe { points: Vec::new(), ..keyframe });
+        self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), ..keyframe });
         self.gap = false;
         Ok(if self.is_complete() { self.flush() } else { None })
     }
@@ -213,7 +236,7 @@ impl SubmapBuilder {
         if !keyframe.pose.pose.translation.iter().all(|x| x.abs() <= POSITION_MAX) {
             return Err(KeyframeError::BadPosition);
         }
-        if self.config.sensor == Sensor::Laser2d {
+        if self.config.sensor.is_planar() {
             let tilt = libm::acos(keyframe.pose.pose.rotation.matrix()[(2, 2)].clamp(-1.0, 1.0));
             if tilt > TILT_MAX {
                 return Err(KeyframeError::NotPlanar { tilt });
@@ -224,6 +247,14 @@ impl SubmapBuilder {
         }
         if let Some(index) = keyframe.points.iter().position(|p| p.iter().any(|x| !x.is_finite())) {
             return Err(KeyframeError::PointNotFinite { index });
+        }
+        let (points, marks) = (keyframe.points.len(), keyframe.marks.len());
+        if marks != if self.config.sensor.sees_landmarks() { points } else { 0 } {
+            return Err(KeyframeError::Marks { points, marks });
+        }
+        let in_range = |mark: &Mark| mark.covariance.sigmas().iter().all(|sigma| SIGMA_RANGE.contains(sigma));
+        if let Some(index) = keyframe.marks.iter().position(|mark| !in_range(mark)) {
+            return Err(KeyframeError::MarkOutOfRange { index });
         }
         let allowed = JUMP_SUBMAPS_MAX * self.config.distance_m;
         let moved =
@@ -238,7 +269,8 @@ impl SubmapBuilder {
     fn step(&mut self, keyframe: &Keyframe) -> Option<PoseWithCovariance> {
         let step = self.last.as_ref().map(|last| motion(last, keyframe, self.gap, &self.config));
         match self.config.sensor {
-            Sensor::Points3d => step,
+            Sensor::Points3d | Sensor::Landmarks => step,
+            Sensor::Landmarks2d => step.as_ref().map(flat_motion),
             Sensor::Laser2d => self.sharpener.sharpen(step, &keyframe.points, self.config.voxel_m),
         }
     }
@@ -247,7 +279,7 @@ impl SubmapBuilder {
     /// sharpen the motion, the submaps' frame is not the SLAM's.
     fn way_apart(&self) -> f64 {
         match self.config.sensor {
-            Sensor::Points3d => 0.0,
+            Sensor::Points3d | Sensor::Landmarks | Sensor::Landmarks2d => 0.0,
             Sensor::Laser2d => f64::from(self.next_index) * self.config.distance_m,
         }
     }
@@ -280,12 +312,24 @@ impl SubmapBuilder {
                 motions: Vec::new(),
                 keyframes: Vec::new(),
                 cloud: Thinner::new(self.config.voxel_m, self.config.points_max),
+                landmarks: Gatherer::new(self.config.voxel_m, self.config.points_max),
             }
         });
         let t_first_body = open.t_frame_first.inverse() * t_frame_body;
         open.stamps[1] = keyframe.stamp;
         let position = u16::try_from(open.keyframes.len()).unwrap_or(u16::MAX);
         open.keyframes.push(t_first_body);
+        match self.config.sensor {
+            Sensor::Landmarks => open.landmarks.add(position, &t_first_body, &keyframe.points, &keyframe.marks),
+            Sensor::Landmarks2d => {
+                let (points, marks) = flattened(&keyframe.points, &keyframe.marks);
+                open.landmarks.add(position, &t_first_body, &points, &marks);
+            }
+            Sensor::Points3d | Sensor::Laser2d => {}
+        }
+        if self.config.sensor.sees_landmarks() {
+            return;
+        }
         let is_flat = self.config.sensor == Sensor::Laser2d;
         let height = |p: &[f32; 3]| if is_flat { [p[0], p[1], 0.0] } else { *p };
         open.cloud.add(keyframe.points.iter().map(|p| moved(&t_first_body, height(p).map(f64::from))), position);
@@ -322,16 +366,22 @@ impl Open {
         let t_first_anchor = self.t_first_anchor();
         let t_anchor_first = t_first_anchor.inverse();
         let odometry = self.odometry_to_anchor(index == 0);
-        let (cloud, seen_from) = self.cloud.finish();
+        let anchor = self.middle();
+        let keyframes: Vec<Se3> = self.keyframes.iter().map(|t_first_body| t_anchor_first * *t_first_body).collect();
+        let constellation = settle(&self.landmarks.finish(), &self.motions, &keyframes, anchor);
+        let (mut cloud, seen_from) = self.cloud.finish();
         let about_anchor = |p: [f32; 3]| moved(&t_anchor_first, p.map(f64::from)).map(|x| x as f32);
+        cloud.iter_mut().for_each(|p| *p = about_anchor(*p));
+        cloud.extend(constellation.landmarks.iter().map(|l| <[f32; 3]>::from(l.at.map(|x| x as f32))));
         Submap {
             index,
             stamps: self.stamps,
             odometry,
             t_frame_anchor: self.t_frame_first * t_first_anchor,
-            keyframes: self.keyframes.iter().map(|t_first_body| t_anchor_first * *t_first_body).collect(),
-            cloud: cloud.into_iter().map(about_anchor).collect(),
+            keyframes,
+            cloud,
             seen_from,
+            constellation,
         }
     }
 

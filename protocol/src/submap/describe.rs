@@ -5,6 +5,7 @@ use super::Submap;
 use super::block::Block;
 use super::descriptor::{Code, Projection};
 use super::features::{Codes, FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints, UNSEEN, VIEWPOINTS_MAX, in_voxels};
+use super::landmarks;
 use super::planar;
 use super::rings;
 use super::sampling::spread;
@@ -37,6 +38,7 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     match config.sensor {
         Sensor::Points3d => in_space(submap, config),
         Sensor::Laser2d => planar::describe(submap, config),
+        Sensor::Landmarks | Sensor::Landmarks2d => landmarks::describe(submap, config),
     }
 }
 
@@ -65,6 +67,7 @@ fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {
         viewpoints: viewpoints.map(|t_anchor_body| t_anchor_body.translation.map(|x| x as f32).into()).collect(),
         seen_from: within.iter().map(seen_from).collect(),
         codes: Codes::default(),
+        landmarks: None,
         block,
     };
     let shaped: Vec<u32> =
@@ -87,7 +90,7 @@ fn keypoints(block: &Block<0>, shaped: &[u32], count: usize) -> (Keypoints, Vec<
     let mut keypoints = block.like();
     let described = chosen.into_iter().map(|k| block.points[considered[k] as usize].with(projection.pack(&numbers[k])));
     keypoints.points.extend(described);
-    (Keypoints(keypoints), codes)
+    (Keypoints::of_points(keypoints), codes)
 }
 
 /// Positions, in their order, of the share of the codes that differ most from the mean one.

@@ -7,6 +7,7 @@
 
 use super::block::{BARE_LEN, Block, BlockError, HEADER_LEN, Surfel};
 use super::descriptor::{Code, PACKED_LEN, Projection};
+use super::landmarks::{Chart, LANDMARKS_MAX};
 use super::rings;
 use nalgebra::Vector3;
 use std::sync::OnceLock;
@@ -23,10 +24,19 @@ pub const UNSEEN: u8 = 255;
 
 const KEYPOINTS_MAGIC: [u8; 2] = *b"mk";
 const FEATURES_MAGIC: [u8; 2] = *b"mf";
+/// The same of landmarks.
+const LANDMARK_KEYPOINTS_MAGIC: [u8; 2] = *b"ml";
+const LANDMARK_FEATURES_MAGIC: [u8; 2] = *b"mL";
+/// Bytes that a keypoint of a surface takes.
+pub const KEYPOINT_LEN: usize = Block::<PACKED_LEN>::POINT_LEN;
 
 /// The described points that a submap's owner offers to others, most important first, in the anchor frame.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Keypoints(pub(super) Block<PACKED_LEN>);
+pub struct Keypoints {
+    pub(super) block: Block<PACKED_LEN>,
+    /// In the place of points, if these are landmarks.
+    pub(super) landmarks: Option<Chart>,
+}
 
 /// All described points of one's own submap, in the anchor frame, and from where they were seen.
 #[derive(Clone, Debug, PartialEq)]
@@ -38,6 +48,8 @@ pub struct Features {
     pub(super) seen_from: Vec<u8>,
     /// Descriptors, once asked for.
     pub(super) codes: Codes,
+    /// In the place of points, if these are landmarks.
+    pub(super) landmarks: Option<Chart>,
 }
 
 /// A function of the points, computed once.
@@ -52,9 +64,22 @@ impl PartialEq for Codes {
 }
 
 impl Keypoints {
+    /// Keypoints on surfaces.
+    pub(super) fn of_points(block: Block<PACKED_LEN>) -> Self {
+        Self { block, landmarks: None }
+    }
+
+    /// Landmarks.
+    pub(super) fn of_landmarks(chart: Chart) -> Self {
+        Self { block: Block::new(chart.voxel(), 0.0), landmarks: Some(chart) }
+    }
+
     /// The blob: at most 18 + 21 × [`KEYPOINTS_MAX`] bytes.
     pub fn encode(&self) -> Vec<u8> {
-        self.0.encode(KEYPOINTS_MAGIC)
+        match &self.landmarks {
+            Some(chart) => chart.encode(LANDMARK_KEYPOINTS_MAGIC),
+            None => self.block.encode(KEYPOINTS_MAGIC),
+        }
     }
 
     /// Parses a blob.
@@ -62,25 +87,35 @@ impl Keypoints {
     /// # Errors
     /// [`BlockError`] if the bytes are not exactly what [`Keypoints::encode`] writes.
     pub fn decode(bytes: &[u8]) -> Result<Self, BlockError> {
-        Block::decode(bytes, KEYPOINTS_MAGIC, KEYPOINTS_MAX).map(Self)
+        if bytes.starts_with(&LANDMARK_KEYPOINTS_MAGIC) {
+            return Chart::decode(bytes, LANDMARK_KEYPOINTS_MAGIC, LANDMARKS_MAX).map(Self::of_landmarks);
+        }
+        Block::decode(bytes, KEYPOINTS_MAGIC, KEYPOINTS_MAX).map(Self::of_points)
     }
 
     /// The first `count` keypoints: an even cover of the submap by fewer points.
     #[must_use]
     pub fn first(&self, count: usize) -> Self {
-        let mut block = self.0.like();
-        block.points.extend(self.0.points.iter().take(count));
-        Self(block)
+        let mut block = self.block.like();
+        block.points.extend(self.block.points.iter().take(count));
+        Self { block, landmarks: self.landmarks.as_ref().map(|chart| chart.first(count)) }
     }
 
     /// The descriptors.
     pub(super) fn codes(&self) -> Vec<Code> {
         let projection = Projection::new();
-        self.0.points.iter().map(|p| projection.unpack(&p.descriptor)).collect()
+        self.block.points.iter().map(|p| projection.unpack(&p.descriptor)).collect()
     }
 }
 
 impl Features {
+    /// Landmarks, and from where they were seen.
+    pub(super) fn of_landmarks(chart: Chart, viewpoints: Vec<[f32; 3]>) -> Self {
+        let block = Block::new(chart.voxel(), 0.0);
+        let codes = Codes::default();
+        Self { block, viewpoints, seen_from: Vec::new(), codes, landmarks: Some(chart) }
+    }
+
     /// Positions of the keyframes, in the anchor frame.
     pub(super) fn viewpoints(&self) -> Vec<Vector3<f64>> {
         self.viewpoints.iter().map(|p| Vector3::from(p.map(f64::from))).collect()
@@ -104,7 +139,10 @@ impl Features {
     /// The features as a private disk record: viewpoints (12 bytes each, one byte for their number), one byte a point
     /// that tells which saw it, then 9 bytes a point.
     pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = self.block.encode(FEATURES_MAGIC);
+        let mut bytes = match &self.landmarks {
+            Some(chart) => chart.encode(LANDMARK_FEATURES_MAGIC),
+            None => self.block.encode(FEATURES_MAGIC),
+        };
         bytes.extend(&self.seen_from);
         self.viewpoints.iter().flatten().for_each(|x| bytes.extend(x.to_le_bytes()));
         bytes.push(self.viewpoints.len() as u8);
@@ -130,6 +168,10 @@ impl Features {
         if viewpoints.iter().flatten().any(|x| !x.is_finite()) {
             return Err(BlockError::BadScale);
         }
+        if rest.starts_with(&LANDMARK_FEATURES_MAGIC) {
+            let chart = Chart::decode(rest, LANDMARK_FEATURES_MAGIC, LANDMARKS_MAX)?;
+            return Ok(Self::of_landmarks(chart, viewpoints));
+        }
         // What remains is the block and one byte for each of its points.
         let points = rest.len().saturating_sub(HEADER_LEN) / (BARE_LEN + 1);
         let (block, seen_from) = rest.split_at(rest.len() - points);
@@ -137,7 +179,10 @@ impl Features {
         let good = |&&seen: &&u8| seen == UNSEEN || usize::from(seen) < count;
         match seen_from.iter().position(|seen| !good(&seen)) {
             Some(index) => Err(BlockError::NotCanonical { index }),
-            None => Ok(Self { block, viewpoints, seen_from: seen_from.to_vec(), codes: Codes::default() }),
+            None => {
+                let seen_from = seen_from.to_vec();
+                Ok(Self { block, viewpoints, seen_from, codes: Codes::default(), landmarks: None })
+            }
         }
     }
 }
@@ -150,32 +195,32 @@ pub(super) fn in_voxels<const N: usize>(block: &Block<N>) -> (Vec<[f32; 3]>, Vec
 }
 
 macro_rules! described_points {
-    ($($kind:ty, $block:tt);*) => {$(
+    ($($kind:ty),*) => {$(
         impl $kind {
             /// Number of points.
             pub fn len(&self) -> usize {
-                self.$block.points.len()
+                self.landmarks.as_ref().map_or(self.block.points.len(), Chart::len)
             }
 
             /// Whether there are none.
             pub fn is_empty(&self) -> bool {
-                self.$block.points.is_empty()
+                self.len() == 0
             }
 
             /// Edge of the voxel that the cloud was thinned to, frame units.
             pub fn voxel(&self) -> f64 {
-                self.$block.voxel()
+                self.landmarks.as_ref().map_or(self.block.voxel(), Chart::voxel)
             }
 
-            /// The points as pieces of surface.
+            /// The points as pieces of surface; none if these are landmarks.
             pub fn surfels(&self) -> Vec<Surfel> {
-                self.$block.surfels()
+                self.block.surfels()
             }
         }
     )*};
 }
 
-described_points!(Keypoints, 0; Features, block);
+described_points!(Keypoints, Features);
 
 #[cfg(test)]
 mod tests {

@@ -19,6 +19,7 @@ mod descriptor;
 pub mod features;
 mod grid;
 mod hypotheses;
+pub mod landmarks;
 mod matching;
 mod near;
 mod odometry;
@@ -40,6 +41,7 @@ pub use block::{BlockError, Surfel};
 pub use builder::{KeyframeError, Submap, SubmapBuilder};
 pub use describe::{Described, describe};
 pub use features::{Features, Keypoints};
+pub use landmarks::Mark;
 pub use matching::{Matches, fit, match_keypoints};
 pub use refine::{RefineConfig, RefineError, Refined, refine};
 pub use register::{RegisterConfig, RegisterError, Registered, register};
@@ -58,8 +60,10 @@ pub struct Keyframe {
     pub pose: PoseWithCovariance,
     /// What the covariance describes.
     pub covariance_of: CovarianceOf,
-    /// Points in the body frame, frame units.
+    /// Points in the body frame, frame units: of surfaces, or the places of landmarks.
     pub points: Vec<[f32; 3]>,
+    /// Of landmarks: what else is known of each point. Empty where points lie on surfaces.
+    pub marks: Vec<Mark>,
 }
 
 /// What a keyframe's covariance describes.

@@ -137,7 +137,7 @@ pub enum RegisterError {
 pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) -> Result<Registered, RegisterError> {
     check_comparable(theirs, mine)?;
     let voxel = mine.voxel();
-    let their_cloud = cloud(in_voxels(&theirs.0), theirs.voxel() / voxel);
+    let their_cloud = cloud(in_voxels(&theirs.block), theirs.voxel() / voxel);
     let my_cloud = cloud(in_voxels(&mine.block), 1.0);
     let my_points: Vec<Vector3<f64>> = my_cloud.points.iter().map(|p| p * voxel).collect();
     let pairings = pair_up(theirs, mine, &my_points);

@@ -126,8 +126,8 @@ fn keypoints_on_one_spot_are_refused() {
     let mine = room(6);
     let theirs = |share: f64| {
         let mut keypoints = moved_room(6, Vector3::new(0.4, -0.3, 1.9), Vector3::new(0.3, 0.1, 0.05)).0.keypoints;
-        let (first, repeated) = (keypoints.0.points[0], (share * keypoints.len() as f64) as usize);
-        keypoints.0.points[..repeated].fill(first);
+        let (first, repeated) = (keypoints.block.points[0], (share * keypoints.len() as f64) as usize);
+        keypoints.block.points[..repeated].fill(first);
         keypoints
     };
     let answer = |share| register(&theirs(share), &mine.features, &settings());

@@ -13,8 +13,10 @@ use thiserror::Error;
 /// Bytes of an encoded summary at most.
 pub const SUMMARY_LEN_MAX: usize = 400;
 
-/// Version of the layout.
+/// Version of the layout: of points on surfaces...
 const VERSION: u8 = 2;
+/// ...and of landmarks.
+const LANDMARKS: u8 = 3;
 /// Numbers of a descriptor that are used.
 const NUMBERS: usize = 16;
 /// Levels of each.
@@ -36,6 +38,8 @@ const ROUNDING: f64 = 1.0 - 1e-9;
 /// What is gossiped of a submap's looks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Summary {
+    /// What the words mean: [`VERSION`] or [`LANDMARKS`].
+    version: u8,
     /// Edge of the voxel the cloud was thinned to, frame units.
     voxel: f32,
     /// Square roots of the levels' shares, number by number, the largest 255; all zero for an empty submap.
@@ -87,11 +91,16 @@ impl Summary {
     pub(super) fn of_shares(voxel: f64, shares: &[f32; WORDS]) -> Self {
         let most = shares.iter().fold(f32::MIN_POSITIVE, |most, &share| most.max(share));
         let words = shares.map(|share| (255.0 * (share / most).sqrt()).round() as u8);
-        Self::new(voxel as f32, words)
+        Self::new(VERSION, voxel as f32, words)
     }
 
-    fn new(voxel: f32, words: [u8; WORDS]) -> Self {
-        Self { voxel, words, square: dot(&words, &words) }
+    /// The summary of a submap of landmarks.
+    pub(super) fn of_landmarks(voxel: f64, shares: &[f32; WORDS]) -> Self {
+        Self { version: LANDMARKS, ..Self::of_shares(voxel, shares) }
+    }
+
+    fn new(version: u8, voxel: f32, words: [u8; WORDS]) -> Self {
+        Self { version, voxel, words, square: dot(&words, &words) }
     }
 
     /// How alike two submaps look: 0 (nothing in common, or thinned to different voxels) to 1 (equal). Symmetric. Real
@@ -108,7 +117,12 @@ impl Summary {
         let bound = 1.0 - (1.0 - least) * (1.0 - least);
         let surely_below = dot * dot < bound * bound * squares * ROUNDING;
         let ratio = f64::from(self.voxel) / f64::from(other.voxel);
-        if surely_below || squares == 0.0 || !(1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio) {
+        // The labels of landmarks do not depend on a voxel, whose unit may be anything.
+        let comparable = match (self.version, other.version) {
+            (LANDMARKS, LANDMARKS) => true,
+            (a, b) => a == b && (1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio),
+        };
+        if surely_below || squares == 0.0 || !comparable {
             return (least <= 0.0).then_some(0.0);
         }
         let bhattacharyya = (dot / squares.sqrt()).clamp(0.0, 1.0);
@@ -118,7 +132,7 @@ impl Summary {
 
     /// The summary as bytes, at most [`SUMMARY_LEN_MAX`].
     pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = vec![VERSION, NUMBERS as u8];
+        let mut bytes = vec![self.version, NUMBERS as u8];
         bytes.extend(self.voxel.to_le_bytes());
         bytes.extend(self.words);
         bytes
@@ -130,20 +144,20 @@ impl Summary {
     /// [`SummaryError`], naming the first check that failed.
     pub fn decode(bytes: &[u8]) -> Result<Self, SummaryError> {
         if let [version, numbers, ..] = *bytes
-            && (version, usize::from(numbers)) != (VERSION, NUMBERS)
+            && (!matches!(version, VERSION | LANDMARKS) || usize::from(numbers) != NUMBERS)
         {
             return Err(SummaryError::UnknownLayout { version, numbers });
         }
         let wrong_length = SummaryError::WrongLength { len: bytes.len() };
         let (header, words) = bytes.split_first_chunk::<HEADER_LEN>().ok_or(wrong_length.clone())?;
-        let [_, _, v0, v1, v2, v3] = *header;
+        let [version, _, v0, v1, v2, v3] = *header;
         let voxel = f32::from_le_bytes([v0, v1, v2, v3]);
         let words: [u8; WORDS] = words.try_into().map_err(|_| wrong_length)?;
         let scaled = matches!(words.iter().fold(0, |most, &word| word.max(most)), 0 | 255);
         if !VOXEL_RANGE.contains(&voxel) || !scaled {
             return Err(SummaryError::NotCanonical);
         }
-        Ok(Self::new(voxel, words))
+        Ok(Self::new(version, voxel, words))
     }
 }
 

@@ -29,7 +29,7 @@ fn a_similarity_below_what_is_wanted_is_not_told_and_one_that_is_not_is() {
 #[test]
 fn empty_submaps_and_other_scales_are_like_nothing() {
     let a = room(1).summary;
-    let empty = Summary::new(a.voxel, [0; WORDS]);
+    let empty = Summary::new(VERSION, a.voxel, [0; WORDS]);
     assert_eq!((empty.similarity(&empty), empty.similarity(&a)), (0.0, 0.0));
     let with_voxel = |factor: f32| {
         let mut scaled = a.clone();

@@ -117,6 +117,7 @@ pub fn drive(world: &World, k: usize, count: usize) -> (Vec<Keyframe>, Vec<Se3>)
             pose: PoseWithCovariance { pose: odometry, covariance },
             covariance_of: CovarianceOf::Motion,
             points: world.scan(&pose, 7 * n as u64 + 1000 * k as u64),
+            marks: Vec::new(),
         });
         truth.push(pose);
     }

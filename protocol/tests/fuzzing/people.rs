@@ -113,7 +113,9 @@ pub fn described() -> &'static (Vec<u8>, Vec<u8>) {
         let pose = PoseWithCovariance { pose: Se3::identity(), covariance: sigmas(0.01).unwrap() };
         let mut builder = SubmapBuilder::new(config().submap);
         let points = scan(1, SCAN);
-        builder.push(Keyframe { stamp: Stamp(1), pose, covariance_of: CovarianceOf::Motion, points }).unwrap();
+        builder
+            .push(Keyframe { stamp: Stamp(1), pose, covariance_of: CovarianceOf::Motion, points, marks: Vec::new() })
+            .unwrap();
         let described = submap::describe(&builder.flush().unwrap(), &config().submap);
         (described.keypoints.encode(), described.summary.encode())
     })

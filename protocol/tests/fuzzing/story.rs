@@ -285,7 +285,8 @@ impl<'m, M: Meter> Story<'m, M> {
             points.push(r.numbers::<3>().map(|x| x as f32));
         }
         let covariance_of = if look % 32 == 1 { CovarianceOf::Pose } else { CovarianceOf::Motion };
-        let keyframe = Keyframe { stamp: Stamp(self.stamp), pose: forge::pose(r), covariance_of, points };
+        let keyframe =
+            Keyframe { stamp: Stamp(self.stamp), pose: forge::pose(r), covariance_of, points, marks: Vec::new() };
         self.give(k, Input::Keyframe(keyframe));
     }
 

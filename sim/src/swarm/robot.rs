@@ -263,6 +263,7 @@ impl Slam {
             pose: PoseWithCovariance { pose, covariance: motion.covariance },
             covariance_of: CovarianceOf::Motion,
             points,
+            marks: Vec::new(),
         })
     }
 

@@ -68,6 +68,7 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
         viewpoints: submap.keyframes.iter().take(VIEWPOINTS_MAX).map(eye).collect(),
         seen_from: within.iter().map(seen_from).collect(),
         codes: Codes::default(),
+        landmarks: None,
         block,
     };
     let clear: Vec<u32> = (0..).zip(&lines).filter(|(_, line)| line.roughness.is_some()).map(|(k, _)| k).collect();
@@ -82,7 +83,7 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     let paired: Vec<(Vector2<f64>, Vector2<f64>)> =
         chosen.iter().take(PAIRED).map(|&k| (at[k as usize], lines[k as usize].normal)).collect();
     let summary = Summary::of_shares(config.voxel_m, &shares(&paired));
-    Described { features, keypoints: Keypoints(keypoints), summary, extent }
+    Described { features, keypoints: Keypoints::of_points(keypoints), summary, extent }
 }
 
 /// Where a keypoint was seen from (frame units) in the place of a descriptor, which a point of a floor plan has not: so

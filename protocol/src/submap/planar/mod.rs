@@ -30,8 +30,9 @@ pub use describe::describe;
 pub(super) use motion::Sharpener;
 pub use register::{FlatConfig, register};
 
-use crate::geometry::Se3;
-use flat::Flat;
+use crate::geometry::{PoseWithCovariance, Se3};
+use flat::in_plane;
+pub(super) use flat::{Flat, in_space, wrapped};
 
 /// Standard deviations of height (m) and of roll and pitch (rad) that an alignment claims: two robots on one floor,
 /// their lasers mounted and their floor laid as such things are.
@@ -44,4 +45,9 @@ pub const TILT_MAX: f64 = 0.17;
 /// What is left in the plane of a pose in space.
 pub(super) fn flat(pose: &Se3) -> Se3 {
     Flat::of(pose, 1.0).se3(1.0)
+}
+
+/// What is left in the plane of a motion, by a body that stays in it.
+pub(super) fn flat_motion(motion: &PoseWithCovariance) -> PoseWithCovariance {
+    in_space(&Flat::of(&motion.pose, 1.0), 1.0, &in_plane(&motion.covariance, 1.0), OUT_OF_PLANE_DRIVEN)
 }

@@ -129,12 +129,12 @@ fn chart(mine: &Features, surfels: &[Surfel], walls: &Walls) -> Chart {
 /// What their beams passed through. They sent few of them, so one says as much as several of mine.
 fn their_chart(theirs: &Keypoints, surfels: &[Surfel], voxel: f64) -> Chart {
     let all: Vec<Vector2<f64>> = surfels.iter().map(|s| s.position.xy() / voxel).collect();
-    let step = theirs.0.step();
+    let step = theirs.block.step();
     let beam = |((&to, s), stored): ((&Vector2<f64>, &Surfel), &Stored<PACKED_LEN>)| {
         let from = unpacked(&stored.descriptor, step)? / voxel;
         Some(Beam { from, to, normal: s.roughness.map(|_| s.normal.xy()) })
     };
-    let beams: Vec<Beam> = all.iter().zip(surfels).zip(&theirs.0.points).filter_map(beam).collect();
+    let beams: Vec<Beam> = all.iter().zip(surfels).zip(&theirs.block.points).filter_map(beam).collect();
     Chart::new(&Walls::default(), &all, &beams, 1)
 }
 

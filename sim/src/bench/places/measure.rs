@@ -81,9 +81,10 @@ fn one(sets: &[Set], their: At, mine: At) -> anyhow::Result<Tried> {
     let config = RegisterConfig { solver, ..Default::default() };
     let start = thread_seconds();
     let keypoints = &theirs.described.keypoints;
-    let answer = match sensor {
-        Sensor::Laser2d => planar::register(keypoints, &features, &FlatConfig::default()),
-        Sensor::Points3d => register(keypoints, &features, &config),
+    let answer = if sensor == Sensor::Laser2d {
+        planar::register(keypoints, &features, &FlatConfig::default())
+    } else {
+        register(keypoints, &features, &config)
     };
     let seconds = thread_seconds() - start;
     let pose = answer.as_ref().ok().map(|found| &found.refined.pose);

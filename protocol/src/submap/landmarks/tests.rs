@@ -1,0 +1,527 @@
+//! Landmark worlds with known truth: what is found, what is refused, and whether the stated covariances are honest.
+
+use super::super::builder::{KeyframeError, Submap, SubmapBuilder};
+use super::super::{CovarianceOf, Described, Features, Keyframe, Keypoints, describe};
+use super::{
+    Aligned, Chart, Constellation, Descriptor, Landmark, LandmarkConfig, LandmarkError, Mark, SIGMA_RANGE, register,
+};
+use crate::align::{Model, SolverConfig};
+use crate::config::{Sensor, SubmapConfig};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, So3};
+use crate::time::Stamp;
+use nalgebra::{Matrix3, Vector3, Vector6};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+type Dice = ChaCha8Rng;
+
+fn normal(dice: &mut Dice) -> f64 {
+    let (u, v): (f64, f64) = (dice.random_range(f64::MIN_POSITIVE..1.0), dice.random_range(0.0..1.0));
+    (-2.0 * u.ln()).sqrt() * (core::f64::consts::TAU * v).cos()
+}
+
+fn vector(dice: &mut Dice, half: f64) -> Vector3<f64> {
+    Vector3::from_fn(|_, _| dice.random_range(-half..half))
+}
+
+/// A landmark of the world: where it is, and what it looks like.
+struct Thing {
+    at: Vector3<f64>,
+    descriptor: Descriptor,
+}
+
+fn world(dice: &mut Dice, count: usize, half: f64, flat: bool) -> Vec<Thing> {
+    let thing = |_| {
+        let mut at = vector(dice, half);
+        at.z *= if flat { 0.0 } else { 0.4 };
+        Thing { at, descriptor: dice.random() }
+    };
+    (0..count).map(thing).collect()
+}
+
+/// A covariance with one long axis, as seen from somewhere.
+fn covariance(dice: &mut Dice, sigma: f64, flat: bool) -> Covariance<3> {
+    let turn = if flat { Vector3::new(0.0, 0.0, dice.random_range(0.0..3.0)) } else { vector(dice, 1.5) };
+    let axes = So3::exp(&turn).matrix();
+    let thin = if flat { 1e-3 } else { sigma };
+    let m = axes
+        * Matrix3::from_diagonal(&Vector3::new(9.0 * sigma * sigma, sigma * sigma, thin * thin))
+        * axes.transpose();
+    Covariance::new(m).unwrap()
+}
+
+/// How a robot sees things: from a frame of its own, with noise as stated, labelled by their numbers or described by bits
+/// of which a tenth is wrong.
+struct Look {
+    /// `t_frame_world`.
+    frame: Sim3,
+    sigma: f64,
+    labelled: bool,
+    flat: bool,
+}
+
+impl Look {
+    fn at(&self, dice: &mut Dice, things: &[Thing], which: impl Iterator<Item = usize>) -> Vec<Landmark> {
+        let landmark = |k: usize| {
+            let covariance = covariance(dice, self.sigma * self.frame.scale, self.flat);
+            let root = covariance.matrix().cholesky().unwrap().l();
+            let noise = Vector3::from_fn(|axis, _| if self.flat && axis == 2 { 0.0 } else { normal(dice) });
+            let mut at = self.frame * things[k].at + root * noise;
+            if self.flat {
+                at.z = 0.0;
+            }
+            let mut descriptor = things[k].descriptor;
+            for _ in 0..26 {
+                let bit: usize = dice.random_range(0..256);
+                descriptor[bit / 8] ^= 1 << (bit % 8);
+            }
+            let label = self.labelled.then_some(k as u32);
+            let mark = Mark { covariance, label, descriptor: (!self.labelled).then_some(descriptor) };
+            Landmark { at, mark, sightings: 3 }
+        };
+        which.map(landmark).collect()
+    }
+}
+
+fn constellation(landmarks: &[Landmark]) -> Constellation {
+    Constellation { landmarks: landmarks.to_vec(), ..Constellation::default() }
+}
+
+fn offered(landmarks: &[Landmark], voxel: f64) -> Keypoints {
+    let keypoints = Keypoints::of_landmarks(Chart::new(voxel, &constellation(landmarks)));
+    Keypoints::decode(&keypoints.encode()).unwrap()
+}
+
+fn kept(landmarks: &[Landmark], voxel: f64) -> Features {
+    let features = Features::of_landmarks(Chart::new(voxel, &constellation(landmarks)), vec![[0.0; 3]]);
+    Features::decode(&features.encode()).unwrap()
+}
+
+fn in_space(model: Model) -> LandmarkConfig {
+    let solver = SolverConfig { model, sigma_max: 0.15, support_min: 8.0, ..SolverConfig::default() };
+    LandmarkConfig { planar: false, solver }
+}
+
+fn any_scale() -> LandmarkConfig {
+    in_space(Model::Similarity { scale_min: 0.05, scale_max: 20.0 })
+}
+
+fn planar() -> LandmarkConfig {
+    LandmarkConfig { planar: true, ..in_space(Model::Rigid) }
+}
+
+fn frame(dice: &mut Dice, scale: f64) -> Sim3 {
+    Sim3::new(So3::exp(&vector(dice, 1.8)), vector(dice, 10.0), scale)
+}
+
+fn flat_frame(dice: &mut Dice) -> Sim3 {
+    let turn = Vector3::new(0.0, 0.0, dice.random_range(-3.1..3.1));
+    let mut at = vector(dice, 5.0);
+    at.z = 0.0;
+    Sim3::new(So3::exp(&turn), at, 1.0)
+}
+
+/// Squared distance of an alignment from the truth by its own covariance.
+fn nees(found: &Aligned, truth: &Sim3) -> f64 {
+    match &found.t_mine_theirs {
+        Relative::Similarity(s) => s.covariance.mahalanobis_squared(&truth.local(&s.sim)),
+        Relative::Metric(p) => p.covariance.mahalanobis_squared(&truth.to_se3().local(&p.pose)),
+    }
+}
+
+/// Two robots of unknown scale that saw a third of the world in common, with a third of the matches wrong.
+#[test]
+fn a_similarity_is_found_with_an_honest_covariance() {
+    let mut dice = Dice::seed_from_u64(1);
+    let (trials, mut found, mut sum, mut inside) = (200, 0, 0.0, 0);
+    for _ in 0..trials {
+        let mut things = world(&mut dice, 150, 8.0, false);
+        let scales = [0, 1].map(|_| libm::exp(dice.random_range(-1.5..1.5)));
+        let looks =
+            scales.map(|scale| Look { frame: frame(&mut dice, scale), sigma: 0.02, labelled: false, flat: false });
+        let mine = looks[0].at(&mut dice, &things, 0..90);
+        // A third of what both see has moved meanwhile, or looks like something else.
+        for k in 0..10 {
+            things[40 + 3 * k].at = vector(&mut dice, 8.0);
+        }
+        let theirs = looks[1].at(&mut dice, &things, 40..150);
+        let truth = looks[0].frame * looks[1].frame.inverse();
+        let config = LandmarkConfig {
+            solver: SolverConfig { sigma_max: 0.15 * scales[0], ..any_scale().solver },
+            ..any_scale()
+        };
+        let answer = register(&offered(&theirs, 0.1 * scales[1]), &kept(&mine, 0.1 * scales[0]), &config);
+        let Ok(answer) = answer else { continue };
+        let off = truth.inverse() * answer.t_mine_theirs.sim();
+        assert!(off.rotation.angle() < 0.05 && libm::log(off.scale).abs() < 0.05, "a false alignment: {off:?}");
+        found += 1;
+        let d = nees(&answer, &truth);
+        sum += d;
+        inside += usize::from(d <= 14.067);
+    }
+    let (mean, coverage) = (sum / f64::from(found), inside as f64 / f64::from(found));
+    println!("SIM(3): {found} of {trials} found, NEES {mean:.2} for 7, {:.1} % inside 95 %", 100.0 * coverage);
+    assert!(found >= trials * 97 / 100, "{found}");
+    assert!((4.5..9.0).contains(&mean) && coverage > 0.9, "{mean} {coverage}");
+}
+
+#[test]
+fn labels_in_the_plane_are_enough_for_a_pose() {
+    let mut dice = Dice::seed_from_u64(2);
+    let (trials, mut found, mut sum) = (300, 0, 0.0);
+    for _ in 0..trials {
+        let things = world(&mut dice, 15, 6.0, true);
+        let looks = [0, 1].map(|_| Look { frame: flat_frame(&mut dice), sigma: 0.03, labelled: true, flat: true });
+        let mine = looks[0].at(&mut dice, &things, 0..10);
+        let mut theirs = looks[1].at(&mut dice, &things, 4..15);
+        // One bar code in six is misread.
+        theirs[1].mark.label = Some(3);
+        let truth = looks[0].frame * looks[1].frame.inverse();
+        let Ok(answer) = register(&offered(&theirs, 0.1), &kept(&mine, 0.1), &planar()) else { continue };
+        let off = truth.to_se3().local(&answer.t_mine_theirs.sim().to_se3());
+        assert!(off.norm() < 0.6, "a false alignment: {off:?}");
+        assert!(off[2] == 0.0 && off[3].abs() < 1e-9 && off[4].abs() < 1e-9, "out of the plane: {off:?}");
+        found += 1;
+        sum += nees(&answer, &truth);
+    }
+    let mean = sum / f64::from(found);
+    println!("plane: {found} of {trials} found, NEES {mean:.2} for 3");
+    assert!(found >= trials * 9 / 10, "{found}");
+    assert!((1.5..4.0).contains(&mean), "{mean}");
+}
+
+/// Labels and descriptors of other things, in space and in the plane: nothing is ever found.
+#[test]
+fn lies_are_refused() {
+    let mut dice = Dice::seed_from_u64(3);
+    for trial in 0..400 {
+        let flat = trial % 2 == 0;
+        let (here, there) = (world(&mut dice, 40, 6.0, flat), world(&mut dice, 40, 6.0, flat));
+        let labelled = trial % 4 < 2;
+        let look = |frame| Look { frame, sigma: 0.03, labelled, flat };
+        let frames = [0, 1].map(|_| if flat { flat_frame(&mut dice) } else { frame(&mut dice, 1.0) });
+        let count = dice.random_range(3..40);
+        let mine = look(frames[0]).at(&mut dice, &here, 0..count);
+        let mut theirs = look(frames[1]).at(&mut dice, &there, 0..count);
+        if !labelled {
+            theirs.iter_mut().zip(&mine).for_each(|(t, m)| t.mark.descriptor = m.mark.descriptor);
+        }
+        for config in if flat { vec![planar()] } else { vec![any_scale(), in_space(Model::Rigid)] } {
+            let answer = register(&offered(&theirs, 0.1), &kept(&mine, 0.1), &config);
+            assert!(answer.is_err(), "{trial}: {answer:?}");
+        }
+    }
+}
+
+/// What geometry cannot tell is refused with its reason.
+#[test]
+fn poor_constellations_are_refused() {
+    let mut dice = Dice::seed_from_u64(4);
+    let look = |labelled, flat, frame| Look { frame, sigma: 0.005, labelled, flat };
+    let unmoved = Sim3::identity();
+    let answer = |mine: &[Landmark], theirs: &[Landmark], config: &LandmarkConfig| {
+        register(&offered(theirs, 0.1), &kept(mine, 0.1), config)
+    };
+    let mut things = world(&mut dice, 20, 6.0, false);
+    let turned = frame(&mut dice, 1.0);
+    let both = |dice: &mut Dice, things: &[Thing], count| {
+        let mine = look(true, false, unmoved).at(dice, things, 0..count);
+        (mine, look(true, false, turned).at(dice, things, 0..count))
+    };
+    let (mine, theirs) = both(&mut dice, &things, 20);
+    for config in [any_scale(), in_space(Model::Rigid)] {
+        let good = answer(&mine, &theirs, &config);
+        assert!(good.is_ok(), "{good:?}");
+        let few = answer(&mine[..3], &theirs[..3], &config);
+        assert!(matches!(few, Err(LandmarkError::TooFew { matches: 3, .. })), "{few:?}");
+        // A mirrored world is another world.
+        let mut mirrored = theirs.clone();
+        mirrored.iter_mut().for_each(|l| l.at.z = -l.at.z);
+        assert!(answer(&mine, &mirrored, &config).is_err());
+        // Every label twice on one side is no label.
+        let twice: Vec<Landmark> = theirs.iter().chain(&theirs).copied().collect();
+        let none = answer(&mine, &twice, &config);
+        assert!(matches!(none, Err(LandmarkError::TooFew { matches: 0, .. })), "{none:?}");
+        // Half of the labels are those of their neighbours.
+        let mut half = theirs.clone();
+        half.iter_mut().take(10).for_each(|l| l.mark.label = l.mark.label.map(|k| (k + 1) % 10));
+        let lies = answer(&mine, &half, &config);
+        assert!(matches!(lies, Err(LandmarkError::LabelsLie { agreeing: 10, labelled: 20 })), "{lies:?}");
+    }
+    for (k, thing) in things.iter_mut().enumerate() {
+        thing.at = Vector3::new(k as f64 * 0.5, 0.0, 0.0);
+    }
+    let (mine, theirs) = both(&mut dice, &things, 20);
+    let line = answer(&mine, &theirs, &in_space(Model::Rigid));
+    assert!(matches!(line, Err(LandmarkError::Degenerate { .. })), "{line:?}");
+    for thing in &mut things {
+        thing.at = vector(&mut dice, 6.0);
+        thing.at.z = 0.0;
+    }
+    let (mine, theirs) = both(&mut dice, &things, 20);
+    let plane = answer(&mine, &theirs, &in_space(Model::Rigid));
+    assert!(matches!(plane, Err(LandmarkError::Mirror { .. })), "{plane:?}");
+    assert_eq!(answer(&mine, &theirs, &planar()), Err(LandmarkError::NotPlanar));
+
+    // In the plane: three could agree by accident, four are enough; a mirrored world is another one.
+    let flat = look(true, true, unmoved).at(&mut dice, &things, 0..20);
+    let config = planar();
+    assert!(matches!(answer(&flat[..3], &flat[..3], &config), Err(LandmarkError::TooFew { matches: 3, needed: 4 })));
+    assert!(answer(&flat[..4], &flat[..4], &config).is_ok());
+    let mut mirrored = flat.clone();
+    mirrored.iter_mut().for_each(|l| l.at.y = -l.at.y);
+    assert!(answer(&flat, &mirrored, &config).is_err());
+    // One cluster seen from afar leaves the angle open.
+    let mut cluster = flat.clone();
+    cluster.iter_mut().for_each(|l| l.at = l.at * 0.001 + Vector3::new(20.0, 0.0, 0.0));
+    assert!(answer(&cluster, &cluster, &config).is_err());
+    // Half of what they saw was moved, together: two answers.
+    let mut moved = flat.clone();
+    moved.iter_mut().take(10).for_each(|l| l.at.x += 3.0);
+    let two = answer(&flat, &moved, &config);
+    assert!(matches!(two, Err(LandmarkError::Ambiguous { members: 10, rival: 10 })), "{two:?}");
+}
+
+fn config(sensor: Sensor) -> SubmapConfig {
+    SubmapConfig { sensor, keyframes_max: 16, distance_m: 3.0, rotation_deg: 360.0, ..SubmapConfig::default() }
+}
+
+fn keyframe(stamp: i64, pose: Se3, points: Vec<[f32; 3]>, marks: Vec<Mark>) -> Keyframe {
+    let covariance = Covariance::from_sigmas(MOTION).unwrap();
+    let pose = PoseWithCovariance { pose, covariance };
+    Keyframe { stamp: Stamp(stamp), pose, covariance_of: CovarianceOf::Motion, points, marks }
+}
+
+/// Standard deviations of a keyframe's motion in these tests.
+const MOTION: [f64; 6] = [0.02, 0.01, 1e-3, 1e-4, 1e-4, 0.02];
+
+/// A robot that drives a curve and sees landmarks all about with range and bearing; `t_frame_world` is where its frame
+/// truly lies at the anchor.
+fn driven(dice: &mut Dice, things: &[Thing], labelled: bool) -> (Submap, Se3) {
+    let mut builder = SubmapBuilder::new(config(Sensor::Landmarks2d));
+    let step = Se3::new(So3::exp(&Vector3::new(0.0, 0.0, 0.1)), Vector3::new(0.15, 0.0, 0.0));
+    let mut start = flat_frame(dice).to_se3();
+    start.translation *= 0.4;
+    let (mut truth, mut odometry) = (start, Se3::identity());
+    let mut truths = Vec::new();
+    for stamp in 0.. {
+        let (mut points, mut marks) = (Vec::new(), Vec::new());
+        for (k, thing) in things.iter().enumerate() {
+            let at = truth.inverse() * thing.at;
+            let (range, bearing) = (at.norm(), at.y.atan2(at.x));
+            if range > 5.0 || dice.random_range(0..3) != 0 {
+                continue;
+            }
+            let (r, b) = (range + 0.08 * normal(dice), bearing + 0.015 * normal(dice));
+            let axes = So3::exp(&Vector3::new(0.0, 0.0, b)).matrix();
+            let variances = Vector3::new(0.08 * 0.08, (0.015 * r) * (0.015 * r), 1e-6);
+            let covariance = Covariance::new(axes * Matrix3::from_diagonal(&variances) * axes.transpose()).unwrap();
+            points.push([(r * b.cos()) as f32, (r * b.sin()) as f32, 0.3]);
+            marks.push(Mark { covariance, label: labelled.then_some(k as u32), descriptor: Some(thing.descriptor) });
+        }
+        truths.push(truth);
+        if let Some(submap) = builder.push(keyframe(stamp, odometry, points, marks)).unwrap() {
+            let anchor = (submap.keyframes.len() - 1) / 2;
+            return (submap, truths[anchor]);
+        }
+        let noise = Vector6::from_fn(|k, _| if matches!(k, 2..=4) { 0.0 } else { MOTION[k] * normal(dice) });
+        truth = truth * step;
+        odometry = odometry * step.retract(&noise);
+    }
+    unreachable!("a submap ends")
+}
+
+/// Landmarks of whole submaps, and alignments of these: covariances are honest in both.
+#[test]
+fn a_drive_becomes_landmarks_and_drives_are_aligned() {
+    let mut dice = Dice::seed_from_u64(5);
+    let (mut places, mut count, mut aligned, mut sum) = (0.0, 0, 0, 0.0);
+    let trials = 100;
+    for _ in 0..trials {
+        let things = world(&mut dice, 25, 5.0, true);
+        let submaps = [0, 1].map(|_| driven(&mut dice, &things, true));
+        let [(mine, t_world_mine), (theirs, t_world_theirs)] = &submaps;
+        for landmark in &mine.constellation.landmarks {
+            let at = t_world_mine.inverse() * things[landmark.mark.label.unwrap() as usize].at;
+            let mut j = nalgebra::Matrix3x6::identity();
+            j.fixed_view_mut::<3, 3>(0, 3).copy_from(&-crate::geometry::so3::hat(&landmark.at));
+            let common = j * mine.constellation.common.matrix() * j.transpose();
+            let whole = Covariance::new(landmark.mark.covariance.matrix() + common).unwrap();
+            places += whole.mahalanobis_squared(&(landmark.at - at));
+            count += 1;
+        }
+        let described = [mine, theirs].map(|s| describe(s, &config(Sensor::Landmarks2d)));
+        let [Described { features, .. }, Described { keypoints, .. }] = &described;
+        let found = match register(keypoints, features, &planar()) {
+            Ok(found) => found,
+            Err(error) => {
+                println!("drives: {error}");
+                continue;
+            }
+        };
+        let truth = Sim3::from_se3(&(t_world_mine.inverse() * *t_world_theirs));
+        aligned += 1;
+        sum += nees(&found, &truth);
+    }
+    let (places, sum) = (places / f64::from(count), sum / f64::from(aligned));
+    println!("drives: landmarks NEES {places:.2} for 2, {aligned} of {trials} aligned, NEES {sum:.2} for 3");
+    assert!((1.5..2.6).contains(&places), "{places}");
+    assert!(aligned >= trials * 9 / 10 && (1.0..4.5).contains(&sum), "{aligned} {sum}");
+}
+
+#[test]
+fn sightings_without_labels_are_told_apart_by_place_and_looks() {
+    let mut dice = Dice::seed_from_u64(6);
+    let things = world(&mut dice, 25, 5.0, true);
+    let (labelled, _) = driven(&mut Dice::seed_from_u64(7), &things, true);
+    let (bare, _) = driven(&mut Dice::seed_from_u64(7), &things, false);
+    // Same dice: the same sightings, which fall into the same landmarks.
+    let (bare, labelled) = (bare.constellation, labelled.constellation);
+    assert_eq!(bare.landmarks.len(), labelled.landmarks.len());
+    for (a, b) in bare.landmarks.iter().zip(&labelled.landmarks) {
+        assert_eq!((a.at, a.mark.covariance, a.sightings), (b.at, b.mark.covariance, b.sightings));
+    }
+}
+
+/// A label seen in two places is nobody's; one misread among many sightings is left out.
+#[test]
+fn a_label_that_lies_within_a_submap_is_dropped() {
+    let mark =
+        |label| Mark { covariance: Covariance::from_sigmas([0.05; 3]).unwrap(), label: Some(label), descriptor: None };
+    let mut builder = SubmapBuilder::new(config(Sensor::Landmarks));
+    let at = |x: f32| [x, 1.0, 0.2];
+    for k in 0..12 {
+        let moved = Se3::new(So3::identity(), Vector3::new(0.1 * f64::from(k), 0.0, 0.0));
+        let off = 0.1 * k as f32;
+        let two = if k % 2 == 0 { at(2.0 - off) } else { at(4.0 - off) };
+        let misread = if k == 5 { [9.0, 9.0, 9.0] } else { at(3.0 - off) };
+        let points = vec![at(1.0 - off), two, misread];
+        builder.push(keyframe(i64::from(k), moved, points, vec![mark(1), mark(2), mark(3)])).unwrap();
+    }
+    let submap = builder.flush().unwrap();
+    let labels: Vec<u32> = submap.constellation.landmarks.iter().filter_map(|l| l.mark.label).collect();
+    assert_eq!(labels, [1, 3]);
+    let third = submap.t_frame_anchor * submap.constellation.landmarks[1].at;
+    assert!((third - Vector3::new(3.0, 1.0, 0.2)).norm() < 0.02, "{third}");
+}
+
+#[test]
+fn marks_and_points_must_fit_the_sensor() {
+    let mark =
+        |sigma: f64| Mark { covariance: Covariance::from_sigmas([sigma; 3]).unwrap(), label: None, descriptor: None };
+    let try_with = |sensor, points: usize, marks: Vec<Mark>| {
+        let mut builder = SubmapBuilder::new(config(sensor));
+        builder.push(keyframe(1, Se3::identity(), vec![[1.0, 0.0, 0.0]; points], marks)).map(drop)
+    };
+    assert_eq!(try_with(Sensor::Landmarks, 2, vec![mark(0.1); 2]), Ok(()));
+    assert_eq!(try_with(Sensor::Points3d, 2, vec![]), Ok(()));
+    assert_eq!(try_with(Sensor::Landmarks, 2, vec![]), Err(KeyframeError::Marks { points: 2, marks: 0 }));
+    assert_eq!(try_with(Sensor::Landmarks2d, 2, vec![mark(0.1); 3]), Err(KeyframeError::Marks { points: 2, marks: 3 }));
+    assert_eq!(try_with(Sensor::Laser2d, 2, vec![mark(0.1); 2]), Err(KeyframeError::Marks { points: 2, marks: 2 }));
+    let (least, most) = (*SIGMA_RANGE.start(), *SIGMA_RANGE.end());
+    for (sigma, good) in [(least * 1.01, true), (least * 0.99, false), (most * 0.99, true), (most * 1.01, false)] {
+        let told = try_with(Sensor::Landmarks, 1, vec![mark(sigma)]);
+        assert_eq!(told, if good { Ok(()) } else { Err(KeyframeError::MarkOutOfRange { index: 0 }) }, "{sigma}");
+    }
+}
+
+#[test]
+fn memory_is_bounded_and_a_blob_stays_within_its_bytes() {
+    let mut dice = Dice::seed_from_u64(8);
+    let mut builder = SubmapBuilder::new(config(Sensor::Landmarks));
+    let mark = |label| Mark {
+        covariance: Covariance::from_sigmas([0.01; 3]).unwrap(),
+        label: Some(label),
+        descriptor: Some([7; 32]),
+    };
+    for k in 0..3 {
+        let points = (0..1500).map(|_| vector(&mut dice, 50.0).map(|x| x as f32).into()).collect();
+        let marks = (0..1500).map(|n| mark(1500 * k + n)).collect();
+        builder.push(keyframe(i64::from(k), Se3::identity(), points, marks)).unwrap();
+    }
+    let submap = builder.flush().unwrap();
+    assert_eq!(submap.constellation.landmarks.len(), super::LANDMARKS_MAX);
+    let described = describe(&submap, &config(Sensor::Landmarks));
+    assert_eq!(described.features.len(), super::LANDMARKS_MAX);
+    let blob = described.keypoints.encode();
+    assert!((6_900..=7_000).contains(&blob.len()), "{}", blob.len());
+    assert!(described.summary.encode().len() <= super::super::SUMMARY_LEN_MAX);
+}
+
+#[test]
+fn summaries_tell_who_saw_the_same_and_are_of_their_own_kind() {
+    let mut dice = Dice::seed_from_u64(9);
+    let things = world(&mut dice, 60, 5.0, false);
+    for labelled in [true, false] {
+        let look = Look { frame: Sim3::identity(), sigma: 0.01, labelled, flat: false };
+        let mut summary = |which| {
+            let landmarks = look.at(&mut dice, &things, which);
+            super::super::summary::Summary::of_landmarks(0.1, &super::describe::shares(&landmarks))
+        };
+        let (a, near, far) = (summary(0..20), summary(5..25), summary(40..60));
+        assert!(a.similarity(&near) > a.similarity(&far) + 0.03, "{} {}", a.similarity(&near), a.similarity(&far));
+        assert_eq!(super::super::Summary::decode(&a.encode()).unwrap(), a);
+        let room = super::super::testing::room(1).summary;
+        assert_eq!((a.similarity(&room), room.similarity(&a)), (0.0, 0.0));
+    }
+    let room = super::super::testing::room(1);
+    let look = Look { frame: Sim3::identity(), sigma: 0.01, labelled: true, flat: false };
+    let mine = kept(&look.at(&mut dice, &things, 0..20), 0.1);
+    assert_eq!(register(&room.keypoints, &mine, &any_scale()), Err(LandmarkError::NotLandmarks));
+}
+
+#[test]
+fn landmarks_on_the_wire_come_back_or_are_refused() {
+    let mut dice = Dice::seed_from_u64(10);
+    let things = world(&mut dice, 6, 5.0, false);
+    let look = |labelled| Look { frame: Sim3::identity(), sigma: 0.02, labelled, flat: false };
+    let mut landmarks = look(true).at(&mut dice, &things, 0..3);
+    landmarks.extend(look(false).at(&mut dice, &things, 3..6));
+    let keypoints = offered(&landmarks, 0.1);
+    let bytes = keypoints.encode();
+    for (a, b) in landmarks.iter().zip(keypoints.landmarks.as_ref().unwrap().landmarks()) {
+        assert!((a.at - b.at).amax() < 0.001 && a.mark.label == b.mark.label && a.mark.descriptor == b.mark.descriptor);
+        // Rounding never makes a landmark surer by more than a few percent in any direction.
+        let least = (b.mark.covariance.matrix() - a.mark.covariance.matrix() * 0.9).symmetric_eigenvalues().min();
+        assert!(least > 0.0, "{least}");
+    }
+    for len in 0..bytes.len() {
+        assert!(Keypoints::decode(&bytes[..len]).is_err(), "cut to {len}");
+    }
+    assert!(Keypoints::decode(&[&bytes[..], &[0]].concat()).is_err());
+    assert!(Features::decode(&bytes).is_err());
+    for at in 0..bytes.len() {
+        for bit in 0..8 {
+            let mut bytes = bytes.clone();
+            bytes[at] ^= 1 << bit;
+            if let Ok(other) = Keypoints::decode(&bytes) {
+                assert_eq!(other.encode(), bytes, "{at} {bit}");
+            }
+        }
+    }
+}
+
+/// A dozen landmarks are enough, with or without wrong ones among them: similarities were once found among many only.
+#[test]
+fn a_dozen_landmarks_are_enough_for_a_similarity() {
+    let mut dice = Dice::seed_from_u64(11);
+    for (count, wrong) in [(10, 0), (12, 0), (12, 3), (16, 4), (40, 0), (40, 10)] {
+        for trial in 0..20 {
+            let mut things = world(&mut dice, count, 6.0, false);
+            let scales = [0, 1].map(|_| libm::exp(dice.random_range(-1.0..1.0)));
+            let looks = scales.map(|s| Look { frame: frame(&mut dice, s), sigma: 0.01, labelled: true, flat: false });
+            let mine = looks[0].at(&mut dice, &things, 0..count);
+            for thing in &mut things[..wrong] {
+                thing.at = vector(&mut dice, 6.0);
+            }
+            let theirs = looks[1].at(&mut dice, &things, 0..count);
+            let [my_voxel, their_voxel] = scales.map(|scale| 0.1 * scale);
+            let solver = SolverConfig { sigma_max: 1.5 * my_voxel, ..any_scale().solver };
+            let config = LandmarkConfig { solver, ..any_scale() };
+            let answer = register(&offered(&theirs, their_voxel), &kept(&mine, my_voxel), &config);
+            let found = answer.unwrap_or_else(|error| panic!("{count} with {wrong} wrong, {trial}: {error}"));
+            let off = (looks[0].frame * looks[1].frame.inverse()).inverse() * found.t_mine_theirs.sim();
+            assert!(off.rotation.angle() < 0.05 && libm::log(off.scale).abs() < 0.05, "a false alignment: {off:?}");
+        }
+    }
+}
