@@ -3,7 +3,7 @@
 
 use super::Agent;
 use super::io::{Event, JobId};
-use super::job::{AlignJob, Job, Measured};
+use super::job::{AlignJob, Job, Look, Measured};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
 use super::negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work,
@@ -12,11 +12,12 @@ use super::shortlist::Candidate;
 use crate::config::AlignConfig;
 use crate::geometry::Relative;
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
-use crate::submap::Summary;
+use crate::submap::{Keypoints, Summary};
 use crate::time::Instant;
 use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, VerdictFact, VerdictOutcome};
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// When a fetch is looked at again that nobody can serve now.
 const FETCH_AGAIN: Duration = Duration::from_millis(500);
@@ -139,7 +140,9 @@ impl Agent {
                 break;
             }
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
-            if self.negotiation.features(mine).is_none() || self.start_alignment(mine, theirs, Purpose::Propose) {
+            let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);
+            let lacks = ours.any(|id| self.negotiation.features(id).is_none());
+            if lacks || self.start_alignment(mine, theirs, Purpose::Propose) {
                 self.negotiation.mark_tried(pair_of(mine, theirs));
             }
         }
@@ -165,7 +168,8 @@ impl Agent {
     /// two submaps cannot touch, or where the two frames are tied together well enough.
     fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
         let (a, b) = pair_of(candidate.mine, candidate.theirs);
-        if self.is_out_of_reach(candidate.theirs) {
+        let is_loop = self.is_loop(candidate.mine, candidate.theirs);
+        if self.is_out_of_reach(candidate.theirs) || (is_loop && self.is_out_of_reach(candidate.mine)) {
             return None;
         }
         if stated.get(&(a.frame, b.frame)).is_some_and(|&n| n >= ALIGNMENTS_PER_FRAME_PAIR) {
@@ -206,20 +210,20 @@ impl Agent {
         0.5 * (x * x + y * y + z * z).sqrt()
     }
 
-    /// Starts aligning a pair, if the other side's keypoints are here; otherwise has them fetched.
+    /// Starts aligning a pair, if the keypoints it takes are here; otherwise has them fetched.
     fn start_alignment(&mut self, mine: SubmapId, theirs: SubmapId, purpose: Purpose) -> bool {
-        let Some(fact) = self.knowledge.submap(theirs) else { return false };
-        let (blob, scale) = (fact.blob, fact.scale);
-        let Some(keypoints) = self.negotiation.keypoints(blob).cloned() else {
-            let fetch = || Fetch::new(theirs.frame.robot, self.now);
-            self.negotiation.fetches.entry(blob).or_insert_with(fetch);
-            return false;
-        };
+        let Some(keypoints) = self.keypoints_of(theirs) else { return false };
         let Some(features) = self.negotiation.features(mine).cloned() else { return false };
+        let back = self.is_loop(mine, theirs).then(|| self.looking_back(mine, theirs));
+        if back.as_ref().is_some_and(Option::is_none) {
+            return false;
+        }
+        let scale = self.knowledge.submap(theirs).map_or(ScaleKind::Unknown, |fact| fact.scale);
         let own_scale = self.config.submap.scale;
         let job = AlignJob {
             theirs: keypoints,
             mine: features,
+            back: back.flatten(),
             config: self.config.align.clone(),
             voxel_m: self.config.submap.voxel_m,
             sensor: self.config.submap.sensor,
@@ -229,6 +233,30 @@ impl Agent {
         let id = self.run_job(Job::Align(Box::new(job)));
         self.negotiation.running.insert(id, Work { mine, theirs, purpose });
         true
+    }
+
+    /// Both submaps are ours: nobody else will look at the pair.
+    fn is_loop(&self, mine: SubmapId, theirs: SubmapId) -> bool {
+        mine.frame.robot == theirs.frame.robot
+    }
+
+    /// What it takes to look at a loop from its other end as well.
+    fn looking_back(&mut self, mine: SubmapId, theirs: SubmapId) -> Option<Look> {
+        let features = self.negotiation.features(theirs).cloned()?;
+        Some((self.keypoints_of(mine)?, features))
+    }
+
+    fn keypoints_of(&mut self, submap: SubmapId) -> Option<Arc<Keypoints>> {
+        let blob = self.knowledge.submap(submap)?.blob;
+        if let Some(keypoints) = self.negotiation.keypoints(blob) {
+            return Some(keypoints.clone());
+        }
+        if let Some(Ok(keypoints)) = self.gossip.blob(blob).map(Keypoints::decode) {
+            return Some(Arc::new(keypoints));
+        }
+        let fetch = || Fetch::new(submap.frame.robot, self.now);
+        self.negotiation.fetches.entry(blob).or_insert_with(fetch);
+        None
     }
 
     /// A seed of our own for this pair: independent of the other endpoint's, the same in a replay.
@@ -248,7 +276,7 @@ impl Agent {
     /// Stops fetching what no pair needs any more: of those that were active, the ones that have not begun.
     fn drop_idle_fetches(&mut self, active: &[Candidate]) {
         let waits = |c: &&Candidate| !self.negotiation.is_tried(pair_of(c.mine, c.theirs));
-        let mut wanted: BTreeSet<SubmapId> = active.iter().filter(waits).map(|c| c.theirs).collect();
+        let mut wanted: BTreeSet<SubmapId> = active.iter().filter(waits).flat_map(|c| [c.mine, c.theirs]).collect();
         for id in self.answers_owed() {
             wanted.extend(self.knowledge.alignment(id).into_iter().flat_map(|fact| [fact.i, fact.j]));
         }

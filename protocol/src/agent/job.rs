@@ -1,6 +1,7 @@
 //! Heavy work as a value: a pure function of its data, run by the shell wherever it likes. The simulator runs jobs
 //! inline and charges virtual time by [`Job::kind`]; a replay runs them again instead of storing their results.
 
+use super::two_sided;
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
 use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, solve_map};
@@ -36,6 +37,9 @@ pub struct DescribeJob {
     pub config: SubmapConfig,
 }
 
+/// Keypoints of one submap, and the features of another to recognise them by.
+pub type Look = (Arc<Keypoints>, Arc<Features>);
+
 /// See [`Job::Align`].
 #[derive(Clone, Debug)]
 pub struct AlignJob {
@@ -43,6 +47,9 @@ pub struct AlignJob {
     pub theirs: Arc<Keypoints>,
     /// Our features, in our anchor frame.
     pub mine: Arc<Features>,
+    /// The other way round, if both submaps are ours and nobody else looks: our keypoints for the other's features.
+    /// Both ways must agree.
+    pub back: Option<Look>,
     /// Acceptance.
     pub config: AlignConfig,
     /// Thinning voxel of our submaps, m: the unit of the noise bound.
@@ -181,33 +188,50 @@ impl SolveJob {
 }
 
 impl AlignJob {
+    fn run(&self) -> Result<Measured, RefusalReason> {
+        let there = self.one_way(&self.theirs, &self.mine)?;
+        let Some((keypoints, features)) = &self.back else { return Ok(there) };
+        let back = self.one_way(keypoints, features)?;
+        let t_mine_theirs = back.t_mine_theirs.inverse();
+        if !two_sided::agree(&there.t_mine_theirs, &t_mine_theirs) {
+            return Err(RefusalReason::Ambiguous);
+        }
+        let t_mine_theirs = two_sided::midway(&there.t_mine_theirs, &t_mine_theirs);
+        Ok(Measured {
+            t_mine_theirs: t_mine_theirs.unwrap_or(there.t_mine_theirs),
+            sigma: there.sigma.max(back.sigma),
+            support: there.support.min(back.support),
+            log10_nfa: there.log10_nfa.max(back.log10_nfa),
+        })
+    }
+
     /// Where units are metres, clouds judge the poses that matches suggest; else the matches alone decide. In the plane
     /// all poses are tried.
-    fn run(&self) -> Result<Measured, RefusalReason> {
+    fn one_way(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, RefusalReason> {
         match (self.sensor, self.scale) {
             (Sensor::Laser2d, ScaleKind::Metric) => {
-                self.measured(submap::planar::register(&self.theirs, &self.mine, &FlatConfig::default()))
+                self.measured(submap::planar::register(theirs, mine, &FlatConfig::default()))
             }
             // In the plane nobody tells a scale.
             (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput),
-            (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(true),
-            (Sensor::Landmarks, _) => self.landmarks(false),
-            (Sensor::Points3d, ScaleKind::Metric) => self.register(),
-            (Sensor::Points3d, ScaleKind::Unknown) => self.align(),
+            (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(theirs, mine, true),
+            (Sensor::Landmarks, _) => self.landmarks(theirs, mine, false),
+            (Sensor::Points3d, ScaleKind::Metric) => self.register(theirs, mine),
+            (Sensor::Points3d, ScaleKind::Unknown) => self.align(theirs, mine),
         }
     }
 
-    fn landmarks(&self, planar: bool) -> Result<Measured, RefusalReason> {
+    fn landmarks(&self, theirs: &Keypoints, mine: &Features, planar: bool) -> Result<Measured, RefusalReason> {
         let config = LandmarkConfig { planar, solver: self.solver() };
-        let found = landmarks::register(&self.theirs, &self.mine, &config).map_err(|e| RefusalReason::from(&e))?;
+        let found = landmarks::register(theirs, mine, &config).map_err(|e| RefusalReason::from(&e))?;
         let landmarks::Aligned { t_mine_theirs, sigma, support, log10_nfa } = found;
         Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
     }
 
-    fn register(&self) -> Result<Measured, RefusalReason> {
+    fn register(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, RefusalReason> {
         let config =
             RegisterConfig { solver: self.solver(), fit_min: self.config.fit_min, ..RegisterConfig::default() };
-        self.measured(submap::register(&self.theirs, &self.mine, &config))
+        self.measured(submap::register(theirs, mine, &config))
     }
 
     fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, RefusalReason> {
@@ -234,8 +258,8 @@ impl AlignJob {
     }
 
     /// Matches, finds a consensus, checks the fit (MATH §4).
-    fn align(&self) -> Result<Measured, RefusalReason> {
-        let matches = submap::match_keypoints(&self.theirs, &self.mine);
+    fn align(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, RefusalReason> {
+        let matches = submap::match_keypoints(theirs, mine);
         let problem = Problem {
             source: &matches.source,
             target: &matches.target,
@@ -246,7 +270,7 @@ impl AlignJob {
             .map_err(|_| RefusalReason::BadInput)?
             .map_err(RefusalReason::from)?;
         let radius = self.voxel_m * 1.5;
-        let fit = submap::fit(&self.theirs, &self.mine, &found.t_target_source.sim(), radius);
+        let fit = submap::fit(theirs, mine, &found.t_target_source.sim(), radius);
         if fit < self.config.fit_min {
             return Err(RefusalReason::PoorFit);
         }

@@ -1,9 +1,9 @@
 //! What the facts say, independent of the order they came in: the submaps, which alignments both endpoints agree on
 //! (the two-sided rule, DESIGN §3), and the estimation problem that follows from them.
 
-use super::distortion;
+use super::{distortion, two_sided};
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
-use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, SimWithCovariance};
+use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::Summary;
 use crate::time::Stamp;
@@ -11,10 +11,6 @@ use crate::wire::fact::{
     AlignmentFact, CarriedFact, Fact, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
 };
 use std::collections::{BTreeMap, BTreeSet};
-
-/// χ² 99.9 % quantiles for 6 and 7 degrees of freedom: two independent alignments of one pair agree below these.
-const CHI2_6_999: f64 = 22.457_744_484_825_32;
-const CHI2_7_999: f64 = 24.321_886_347_856_85;
 
 /// A pair of submaps, the smaller first.
 pub type Pair = (SubmapId, SubmapId);
@@ -223,7 +219,7 @@ impl Knowledge {
         match self.verdict(id, fact).map(|verdict| &verdict.outcome) {
             None => Agreement::Waiting,
             Some(VerdictOutcome::Refused(_)) => Agreement::Disputed,
-            Some(VerdictOutcome::Measured { t_i_j, .. }) if agree(&fact.t_i_j, t_i_j) => Agreement::Agreed,
+            Some(VerdictOutcome::Measured { t_i_j, .. }) if two_sided::agree(&fact.t_i_j, t_i_j) => Agreement::Agreed,
             Some(VerdictOutcome::Measured { .. }) => Agreement::Disputed,
         }
     }
@@ -236,25 +232,12 @@ impl Knowledge {
         all.iter().find(|(verdict, _)| verdict.frame.robot == other).map(|(_, fact)| fact)
     }
 
-    /// The measurement that enters the estimate for an agreed alignment: midway between what the two endpoints measured,
-    /// with the larger (by determinant) of their covariances. Each looked from its own dense cloud at the other's
-    /// keypoints, so their sampling errors differ and partly cancel; what they share stays in the covariance, and no
-    /// single endpoint can overstate its certainty.
+    /// The measurement that enters the estimate for an agreed alignment: midway between what the two endpoints measured.
     fn measurement(&self, id: EntryId, fact: &AlignmentFact) -> Relative {
         let Some(VerdictOutcome::Measured { t_i_j, .. }) = self.verdict(id, fact).map(|v| &v.outcome) else {
             return fact.t_i_j;
         };
-        match (fact.t_i_j, t_i_j) {
-            (Relative::Metric(mine), Relative::Metric(theirs)) => Relative::Metric(PoseWithCovariance {
-                pose: mine.pose.interpolate(&theirs.pose, 0.5),
-                covariance: larger(mine.covariance, theirs.covariance),
-            }),
-            (Relative::Similarity(mine), Relative::Similarity(theirs)) => Relative::Similarity(SimWithCovariance {
-                sim: mine.sim.interpolate(&theirs.sim, 0.5),
-                covariance: larger(mine.covariance, theirs.covariance),
-            }),
-            (mine, _) => mine,
-        }
+        two_sided::midway(&fact.t_i_j, t_i_j).unwrap_or(fact.t_i_j)
     }
 
     /// The estimation problem: one agreed alignment per pair, all sightings, and the unbroken chain of submaps of every
@@ -317,30 +300,6 @@ impl Knowledge {
             }
         }
         chains.into_iter().filter(|(_, (chain, _))| !chain.is_empty()).map(|(f, (chain, _))| (f, chain)).collect()
-    }
-}
-
-/// The covariance with the larger determinant.
-fn larger<const N: usize>(a: Covariance<N>, b: Covariance<N>) -> Covariance<N> {
-    let volume = |c: &Covariance<N>| -> f64 {
-        c.matrix().cholesky().map_or(f64::INFINITY, |l| l.l().diagonal().iter().map(|&x| libm::log(x)).sum())
-    };
-    if volume(&b) > volume(&a) { b } else { a }
-}
-
-/// Whether two independent measurements of one relative pose agree: d² of their difference under the sum of their
-/// covariances, χ² at 99.9 %.
-fn agree(a: &Relative, b: &Relative) -> bool {
-    match (a, b) {
-        (Relative::Metric(a), Relative::Metric(b)) => {
-            let sum = a.covariance.plus(&b.covariance);
-            sum.mahalanobis_squared(&a.pose.local(&b.pose)) <= CHI2_6_999
-        }
-        (Relative::Similarity(a), Relative::Similarity(b)) => {
-            let sum = a.covariance.plus(&b.covariance);
-            sum.mahalanobis_squared(&a.sim.local(&b.sim)) <= CHI2_7_999
-        }
-        _ => false,
     }
 }
 

@@ -14,6 +14,8 @@ mod distortion;
 mod gossip;
 pub mod io;
 pub mod job;
+#[cfg(test)]
+mod job_tests;
 mod knowledge;
 mod mapping;
 mod negotiation;
@@ -22,6 +24,7 @@ mod solving;
 mod stats;
 mod steps;
 mod traffic;
+mod two_sided;
 mod view;
 
 use crate::config::{Config, ConfigError};

@@ -32,7 +32,7 @@ mod scene;
 pub mod summary;
 mod surface;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod thinning;
 mod views;
 mod visibility;
