@@ -64,9 +64,15 @@ impl Outcome<'_> {
         for (k, set) in self.sets.iter().enumerate() {
             self.row(f, set.name, &self.to_find(k).collect::<Vec<_>>())?;
         }
-        let little = |t: &&Tried| t.overlap < OVERLAP_FOUND && t.overlap >= OVERLAP_NONE;
-        self.row(f, "little", &self.tried.iter().filter(little).collect::<Vec<_>>())?;
-        self.row(f, "none", &self.tried.iter().filter(|t| t.overlap < OVERLAP_NONE).collect::<Vec<_>>())?;
+        let in_plane = |t: &&Tried| self.sets[t.their.0].sensor == Sensor::Laser2d;
+        let (plane, space): (Vec<&Tried>, Vec<&Tried>) = self.tried.iter().partition(in_plane);
+        for (names, all) in [(["little", "none"], space), (["little 2d", "none 2d"], plane)] {
+            let below = |least: f64, most: f64| -> Vec<&Tried> {
+                all.iter().filter(|t| t.overlap >= least && t.overlap < most).copied().collect()
+            };
+            self.row(f, names[0], &below(OVERLAP_NONE, OVERLAP_FOUND))?;
+            self.row(f, names[1], &below(0.0, OVERLAP_NONE))?;
+        }
         let strangers =
             self.tried.iter().filter(|t| t.overlap < OVERLAP_FOUND && place(self.sets, t.their).scan.is_some());
         let strangers: Vec<_> = strangers.collect();
