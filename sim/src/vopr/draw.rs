@@ -16,9 +16,9 @@ const ROW_SECS: f64 = 3.0;
 /// More robots than this are a crowd: not all are in reach of all, and faults come in rounds, one for so many robots.
 const CROWD: usize = 10;
 const ROUNDS_MAX: usize = 10;
-/// In a swarm larger than this, robots write less each, the more of them there are: everybody checks everybody's
-/// signatures, and what many do at once is to be attacked, not what they write.
-const TALKATIVE: usize = 100;
+/// In a crowd robots write less each, the more of them there are, by this factor at most: everybody checks
+/// everybody's signatures, and what many do at once is to be attacked, not how much they write.
+const SPARSEST: f64 = 5.0;
 /// Share of the crowds that drive about; the others stand on a grid.
 const MOVING_SHARE: f64 = 0.5;
 /// How many a robot that drives about has in reach, on average.
@@ -75,7 +75,7 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
 
 /// By how much keyframes lie farther apart than among few robots.
 fn sparsity(robots: usize) -> f64 {
-    libm::sqrt(robots.max(TALKATIVE) as f64 / TALKATIVE as f64)
+    libm::sqrt(robots.max(CROWD) as f64 / CROWD as f64).min(SPARSEST)
 }
 
 fn radio(robots: usize, dice: &mut Dice) -> Layout {
