@@ -67,7 +67,7 @@ fn drive(seed: u64) -> (Vec<Speed>, Vec<Sighting>, Vec<(Stamp, Se3)>) {
                 seen.push(Sighting { stamp, barcode: k as u32, range, bearing: bearing + 0.015 * normal() });
             }
         }
-        let (d, a) = (0.95 * 0.1 * 0.05, 0.9 * speed.angular * 0.05);
+        let (d, a): (f64, f64) = (0.95 * 0.1 * 0.05, 0.9 * speed.angular * 0.05);
         let (d, a) = (d + 0.08 * d.sqrt() * normal(), a + (0.14 * a.sqrt() + 0.06 * d.sqrt()) * normal());
         at += Vector2::new((heading + a / 2.0).cos(), (heading + a / 2.0).sin()) * d;
         heading += a;
