@@ -149,7 +149,7 @@ fn prepare(args: &DemoArgs, work: &Path) -> Result<(Vec<Recording>, Bounds)> {
         Kind::Recordings => default,
         Kind::SevenScenes => Bounds { translation_m: 0.05, rotation_deg: 2.0 },
         Kind::Lidar => Bounds { translation_m: 0.75, rotation_deg: 2.0 },
-        Kind::Carmen => Bounds { translation_m: 0.3, rotation_deg: 2.0 },
+        Kind::Carmen | Kind::Mrclam => Bounds { translation_m: 0.3, rotation_deg: 2.0 },
     };
     let recordings = import::prepare(data, &folder, args.seed)?;
     recordings.iter().try_for_each(Recording::check_clouds)?;

@@ -4,7 +4,7 @@
 //! its manifest says so.
 
 use super::error::{Problem, RecordingError, on};
-use super::{Drift, KEYFRAMES, MANIFEST, Recording, Writer, import_laser, import_lidar, import_rgbd};
+use super::{Drift, KEYFRAMES, MANIFEST, Recording, Writer, import_laser, import_lidar, import_mrclam, import_rgbd};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::ids::Name;
@@ -30,6 +30,8 @@ pub enum Kind {
     Lidar,
     /// One `*.clf` or `*.clf.bz2`: a planar laser's log.
     Carmen,
+    /// `RobotN_Odometry.dat`, `RobotN_Measurement.dat` (or packed, `.xz`) and `Barcodes.dat`: robots among landmarks.
+    Mrclam,
 }
 
 /// Tells what `folder` holds.
@@ -57,9 +59,13 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     if any(&|name| import_laser::SUFFIXES.iter().any(|suffix| name.ends_with(suffix))) {
         return Ok(Kind::Carmen);
     }
+    if any(&|name| import_mrclam::robot(name).is_some()) {
+        return Ok(Kind::Mrclam);
+    }
     let why = format!(
         "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \
-         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), or a CARMEN log (*.clf, *.clf.bz2)",
+         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf, *.clf.bz2), or MRCLAM logs \
+         (RobotN_Odometry.dat)",
         import_rgbd::DEPTH_SUFFIX,
         import_lidar::GRAPH,
         import_lidar::POSES,
@@ -85,6 +91,10 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Vec<Recording>, Rec
         }
         Kind::Carmen => {
             import_laser::import(data, out)?;
+            out
+        }
+        Kind::Mrclam => {
+            import_mrclam::import(data, out)?;
             out
         }
     };

@@ -10,6 +10,7 @@ mod error;
 pub mod import;
 mod import_laser;
 mod import_lidar;
+mod import_mrclam;
 mod import_rgbd;
 mod landmarks;
 mod pcd;
