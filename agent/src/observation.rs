@@ -331,7 +331,7 @@ mod tests {
             Keyframe::try_from(message).map(drop)
         };
         assert_eq!(told(&|_| ()), Ok(()));
-        assert_eq!(told(&|m| drop(m.landmarks.pop())), Err(ObservationError::Landmarks { points: 2, landmarks: 1 }));
+        assert_eq!(told(&|m| m.landmarks.truncate(1)), Err(ObservationError::Landmarks { points: 2, landmarks: 1 }));
         let error = CovarianceError::NotPositiveDefinite;
         let refused = ObservationError::LandmarkCovariance { index: 1, error };
         assert_eq!(told(&|m| m.landmarks[1].covariance[1] = 0.5), Err(refused));

@@ -90,9 +90,8 @@ impl Chart {
     pub fn within(&self, bytes: usize) -> Self {
         let mut left = bytes.saturating_sub(HEADER_LEN + COMMON_LEN);
         let fits = |l: &&Stored| {
-            let len = l.len();
-            left = left.checked_sub(len).unwrap_or(0);
-            left > 0 || len == 0
+            left = left.saturating_sub(l.len());
+            left > 0
         };
         let count = self.landmarks.iter().take_while(fits).count();
         self.first(count)
