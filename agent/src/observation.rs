@@ -140,16 +140,18 @@ pub enum ObservationError {
 /// # Errors
 /// [`ObservationError`].
 pub fn keyframe(format: Format, bytes: &[u8]) -> Result<Keyframe, ObservationError> {
-    let message = match format {
-        Format::Json => decode::<KeyframeMessage>(format, bytes),
-        // A message that ends with its points goes on with no landmarks; to one that is complete, a byte is left over.
-        Format::Postcard => match postcard::take_from_bytes(&[bytes, &[0]].concat()) {
-            Ok((value, [] | [0])) => Ok(value),
-            Ok((_, rest)) => Err(ObservationError::Trailing(rest.len() - 1)),
-            Err(e) => Err(ObservationError::Postcard(e.to_string())),
-        },
-    };
+    let message = decode::<KeyframeMessage>(format, bytes).or_else(|error| match error {
+        ObservationError::Postcard(_) => without_landmarks(bytes).ok_or(error),
+        _ => Err(error),
+    });
     Keyframe::try_from(message?)
+}
+
+/// A postcard message that ends with its points.
+fn without_landmarks(bytes: &[u8]) -> Option<KeyframeMessage> {
+    let complete = [bytes, &[0]].concat();
+    let (message, rest) = postcard::take_from_bytes::<KeyframeMessage>(&complete).ok()?;
+    (rest.is_empty() && message.landmarks.is_empty()).then_some(message)
 }
 
 /// Decodes and checks a sighting.
@@ -379,8 +381,15 @@ mod tests {
     #[test]
     fn decoding_takes_the_whole_input_and_known_fields_alone() {
         let good = postcard::to_stdvec(&message()).unwrap();
-        for end in 0..good.len() {
+        // The last byte says that there are no landmarks; a message without it is one that does not know them.
+        let last = good.len() - 1;
+        for end in 0..last {
             assert!(keyframe(Format::Postcard, &good[..end]).is_err(), "{end}");
+        }
+        assert_eq!(keyframe(Format::Postcard, &good[..last]), keyframe(Format::Postcard, &good));
+        let landmarks = postcard::to_stdvec(&of_landmarks()).unwrap();
+        for end in last + 1..landmarks.len() {
+            assert!(keyframe(Format::Postcard, &landmarks[..end]).is_err(), "{end}");
         }
         let long = [good, vec![0, 0]].concat();
         assert_eq!(keyframe(Format::Postcard, &long), Err(ObservationError::Trailing(2)));
