@@ -1,6 +1,5 @@
-//! Five planar robots among bar codes (MRCLAM), through the importer and the cores on perfect wires: no false alignment
-//! is used, and the landmarks of the first robot's map lie where the survey says. The five do not merge yet (see the
-//! README); what is printed tells how far they are from it.
+//! Five planar robots among bar codes (MRCLAM), through the importer and the cores on perfect wires: the five end in one
+//! frame, no false alignment is used, and the landmarks of the joint map lie where the survey says.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
 
 use merganser::demo::trajectory::fit;
@@ -185,7 +184,8 @@ fn five_robots_agree_with_the_survey() {
     println!("survey, with two names exchanged: RMS {:.3} m, {exchanged:.3?}", rms(&exchanged));
     println!("survey, as printed: RMS {:.3} m", rms(&printed));
     println!("merged with {:?}", status.merged_with);
-    assert_eq!(exchanged.len(), 15);
+    assert_eq!(status.merged_with.len(), names.len() - 1, "the five are not in one frame");
+    assert_eq!((joined, exchanged.len()), (map.submaps.len(), 15));
     assert!(!alignments().any(|edge| edge.weight > 0.0 && wrong(edge)), "a false alignment is used");
     assert!(rms(&exchanged) <= RMS_MAX, "{:.3} m", rms(&exchanged));
     assert!(rms(&printed) > 0.5, "as printed two landmarks cannot fit");

@@ -5,25 +5,21 @@ use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Look, Measured};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
-use super::negotiation::{
-    ALIGNMENTS_PER_FRAME_PAIR, FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work,
-};
+use super::negotiation::{FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work};
 use super::shortlist::Candidate;
+use super::stated::Stated;
 use crate::config::AlignConfig;
 use crate::geometry::Relative;
-use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
+use crate::ids::{EntryId, Hash, RobotId, SubmapId};
 use crate::submap::{Keypoints, Summary};
 use crate::time::Instant;
 use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, VerdictFact, VerdictOutcome};
 use core::time::Duration;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// When a fetch is looked at again that nobody can serve now.
 const FETCH_AGAIN: Duration = Duration::from_millis(500);
-
-/// Undisputed alignments stated so far, per pair of frames.
-type Stated = BTreeMap<(FrameId, FrameId), usize>;
 
 impl Agent {
     /// A fact has taken effect: what does it call for?
@@ -155,24 +151,24 @@ impl Agent {
     }
 
     fn stated(&self) -> Stated {
-        let mut stated = Stated::new();
+        let mut stated = Stated::default();
         for (id, fact) in self.knowledge.alignments() {
             if self.knowledge.agreement(id) != Agreement::Disputed {
-                *stated.entry((fact.i.frame, fact.j.frame)).or_default() += 1;
+                stated.count((fact.i, fact.j));
             }
         }
         stated
     }
 
     /// Expected gain of a pair: unmerged frames first, then similarity; nothing where the joint estimate says that the
-    /// two submaps cannot touch, or where the two frames are tied together well enough.
+    /// two submaps cannot touch, or where another alignment of theirs would say too little.
     fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
         let (a, b) = pair_of(candidate.mine, candidate.theirs);
         let is_loop = self.is_loop(candidate.mine, candidate.theirs);
         if self.is_out_of_reach(candidate.theirs) || (is_loop && self.is_out_of_reach(candidate.mine)) {
             return None;
         }
-        if stated.get(&(a.frame, b.frame)).is_some_and(|&n| n >= ALIGNMENTS_PER_FRAME_PAIR) {
+        if stated.is_enough((a, b), self.config.estimate.alignments_min) {
             return None;
         }
         let wish = if candidate.wished { 0.5 } else { 0.0 };

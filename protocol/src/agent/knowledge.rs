@@ -259,7 +259,7 @@ impl Knowledge {
             .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
             .filter_map(|(entry, fact)| tie(entry, fact.i, fact.j, self.measurement(entry, fact)))
             .collect();
-        distortion::charge(&mut alignments);
+        let shares = distortion::charge(&mut alignments);
         let sightings = self.sightings.iter();
         let sightings: Vec<AgreedAlignment> =
             sightings.filter_map(|(entry, fact)| tie(*entry, fact.i, fact.j, Relative::Metric(fact.t_i_j))).collect();
@@ -277,7 +277,7 @@ impl Knowledge {
         let gaps =
             posed.into_iter().filter(|(_, chain)| chain.last().is_some_and(|last| *last as usize >= chain.len()));
         Question {
-            problem: MapProblem { frames, alignments, sightings },
+            problem: MapProblem { frames, alignments, sightings, shares },
             alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
             gaps: gaps.collect(),
         }

@@ -21,6 +21,7 @@ mod mapping;
 mod negotiation;
 mod shortlist;
 mod solving;
+mod stated;
 mod stats;
 mod steps;
 mod traffic;
@@ -51,7 +52,9 @@ use thiserror::Error;
 
 pub use condensing::GONE_IN_A_ROW_MAX;
 pub use knowledge::Agreement;
-pub use negotiation::{ALIGNMENTS_PER_FRAME_PAIR, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP};
+pub use negotiation::{
+    ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP,
+};
 pub use traffic::{POSTPONED_MAX, UNSENT_MAX};
 
 /// A clock that shows more (after 292 years, or because it is broken) stands still for the agent: pauses must end after

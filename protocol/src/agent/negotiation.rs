@@ -2,8 +2,9 @@
 //!
 //! A hash of the pair decides the responsible endpoint, so exactly one begins. Candidates are ranked by expected gain:
 //! pairs of frames that are not merged yet first, then by similarity of the summaries. Pairs that the joint estimate
-//! places out of reach of one another, and frame pairs that already have [`ALIGNMENTS_PER_FRAME_PAIR`] alignments, stay
-//! dormant. Every pair is tried once; every foreign alignment that names us is verified once.
+//! places out of reach of one another, frame pairs that already have [`ALIGNMENTS_PER_FRAME_PAIR`] alignments, and
+//! submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant. Every pair is tried once; every foreign
+//! alignment that names us is verified once.
 
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
@@ -17,6 +18,9 @@ use std::sync::Arc;
 
 /// Undisputed alignments between two frames beyond which no further pair is tried.
 pub const ALIGNMENTS_PER_FRAME_PAIR: usize = 12;
+/// Undisputed alignments of one submap with one other frame beyond which it is tried with no more of that frame's: they
+/// share the submap's errors, so that others tell more.
+pub const ALIGNMENTS_PER_SUBMAP: usize = 3;
 /// Pairs tried for one own submap against one foreign frame.
 pub const TRIES_PER_SUBMAP: usize = 12;
 /// Index distance from which two submaps of one frame may close a loop.

@@ -97,7 +97,15 @@ fn any_problem() -> impl Strategy<Value = MapProblem> {
     });
     let frames = prop::collection::btree_map((0..4u8).prop_map(frame), chain, 0..4);
     let lists = (prop::collection::vec(stated.clone(), 0..30), prop::collection::vec(stated, 0..5));
-    (frames, lists).prop_map(|(frames, (alignments, sightings))| MapProblem { frames, alignments, sightings })
+    let entry = (0..4u8, 0..30u32).prop_map(|(robot, seq)| EntryId { frame: frame(robot), seq });
+    let share = prop_oneof![4 => 0.0..1.0, 1 => any::<f64>()];
+    let shares = prop::collection::btree_map(entry, share, 0..10);
+    (frames, lists, shares).prop_map(|(frames, (alignments, sightings), shares)| MapProblem {
+        frames,
+        alignments,
+        sightings,
+        shares,
+    })
 }
 
 proptest! {

@@ -19,6 +19,9 @@ pub const SIGMA_TRANSLATION_MAX: f64 = 1e4;
 /// Log-scale standard deviation from which a measurement says nothing.
 pub const SIGMA_LOG_SCALE_MAX: f64 = 3.0;
 
+/// Least share of its information with which an alignment counts.
+pub const SHARE_MIN: f64 = 1e-6;
+
 /// What a measurement is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
@@ -58,8 +61,9 @@ impl Intake {
         let (mut entries, mut submaps) = (BTreeSet::new(), BTreeMap::new());
         for (kind, measurement) in alignments.chain(sightings) {
             let unused = intake.refusal(kind, &measurement, &mut entries, &mut submaps);
-            let weight = if unused.is_none() { 1.0 } else { 0.0 };
-            intake.edges.push(EdgeEstimate { kind, measurement, weight, unused });
+            let share = share(problem, kind, measurement.entry);
+            let weight = if unused.is_none() { share } else { 0.0 };
+            intake.edges.push(EdgeEstimate { kind, measurement, weight, share, unused });
         }
         intake
     }
@@ -165,7 +169,7 @@ impl Intake {
         for edge in self.edges.iter_mut().filter(|e| e.is_waiting()) {
             let scale = edge.sigma_scale(sigma_scales);
             if edge.disagreement(scale, &relative).is_some_and(|d| d.is_consistent()) {
-                (edge.weight, edge.unused) = (1.0 / (scale * scale), None);
+                (edge.weight, edge.unused) = (edge.weight_at(scale), None);
                 any = true;
             }
         }
@@ -210,11 +214,14 @@ impl EdgeEstimate {
         relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>,
     ) -> Option<Disagreement> {
         let predicted = relative(self.measurement.i, self.measurement.j)?;
-        Some(predicted.disagreement(&self.measurement.t_i_j.widened(sigma_scale)))
+        Some(predicted.disagreement(&self.measurement.t_i_j.widened(sigma_scale / self.share.sqrt())))
     }
-}
 
-impl EdgeEstimate {
+    /// Its weight where its pair found its standard deviations to need the factor `sigma_scale`.
+    pub(super) fn weight_at(&self, sigma_scale: f64) -> f64 {
+        self.share / (sigma_scale * sigma_scale)
+    }
+
     /// Takes the edge out of the estimate.
     pub(super) fn refuse(&mut self, reason: Unused) {
         (self.weight, self.unused) = (0.0, Some(reason));
@@ -256,6 +263,12 @@ impl Chain {
             weight: 1.0,
         })
     }
+}
+
+/// The share a problem gives a measurement, within bounds; one that is no number is taken as the whole.
+fn share(problem: &MapProblem, kind: Kind, entry: EntryId) -> f64 {
+    let stated = if kind == Kind::Alignment { problem.shares.get(&entry) } else { None };
+    stated.filter(|share| !share.is_nan()).map_or(1.0, |share| share.clamp(SHARE_MIN, 1.0))
 }
 
 fn says_nothing(t: &Relative) -> bool {

@@ -57,6 +57,10 @@ pub struct MapProblem {
     pub alignments: Vec<AgreedAlignment>,
     /// Direct measurements of other robots.
     pub sightings: Vec<AgreedAlignment>,
+    /// Alignments that count in the joint estimate with less than their whole information, because they have errors in
+    /// common with those of other pairs of frames: over 0 to 1, at least [`SHARE_MIN`](super::intake::SHARE_MIN); 1 for
+    /// what is not listed.
+    pub shares: BTreeMap<EntryId, f64>,
 }
 
 /// Why a measurement does not count.
@@ -124,6 +128,8 @@ pub struct EdgeEstimate {
     pub measurement: AgreedAlignment,
     /// What its information was multiplied by; 0 if unused.
     pub weight: f64,
+    /// What its information is multiplied by before anything is held against it.
+    pub(super) share: f64,
     /// Why it does not count; `None` if it does.
     pub unused: Option<Unused>,
 }

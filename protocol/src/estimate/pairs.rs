@@ -114,7 +114,7 @@ impl Pair {
             if self.outcome.status != PairStatus::Merged {
                 edge.refuse(Unused::Unmerged(self.outcome.status));
             } else if self.outcome.used.contains(&k) {
-                edge.weight = 1.0 / (self.outcome.sigma_scale * self.outcome.sigma_scale);
+                edge.weight = edge.weight_at(self.outcome.sigma_scale);
             } else if self.members.len() > self.weighed.len() {
                 // So many stand for the pair that the map may be asked again.
                 edge.refuse(Unused::Waiting);

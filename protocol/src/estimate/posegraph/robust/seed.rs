@@ -39,7 +39,7 @@ impl Seed {
         };
         let tied = closures.iter().filter(|c| [c.i, c.j].iter().all(|id| frames.contains_key(&id.frame)));
         let alignments = tied.map(agreed).collect();
-        let mut intake = Intake::new(&MapProblem { frames, alignments, sightings: Vec::new() });
+        let mut intake = Intake::new(&MapProblem { frames, alignments, ..MapProblem::default() });
         let pairs = pairs::consensus(&mut intake, config);
         let start = pairs::start(&intake, &pairs);
         let used = intake.edges.iter().filter(|e| e.is_used()).map(|e| e.measurement.entry.seq as usize).collect();
