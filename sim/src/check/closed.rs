@@ -15,7 +15,8 @@ pub struct Closed {
     /// The latest epoch that anybody handed an entry of to a disk, by origin.
     latest: BTreeMap<RobotId, u32>,
     /// Every entry that was handed to a disk, and whether to one of another than its writer: only such a one can come
-    /// back. A process that died before its entry was on disk may well write the very same again.
+    /// back, and it does in a message. A process that died before its entry was on disk, or whose disk was replaced by an
+    /// old image of it, may well write the very same again.
     known: BTreeMap<(EntryId, Hash), bool>,
     doubted: BTreeSet<RobotId>,
     forgers: BTreeSet<RobotId>,
@@ -26,6 +27,8 @@ pub struct Closed {
 #[derive(Debug, Default)]
 struct Returned {
     robot: Option<RobotId>,
+    /// The message that it handles.
+    heard: Vec<u8>,
     /// The latest epoch that it knows in this run...
     epoch: Option<u32>,
     /// ...and in every run.
@@ -43,7 +46,7 @@ impl Closed {
         let with_others = self.known.entry(key).or_default();
         *with_others |= !is_own;
         if !is_new {
-            if is_own && *with_others {
+            if is_own && *with_others && contains(&returned.heard, bytes) {
                 returned.epoch = returned.epoch.max(Some(epoch));
                 returned.waiting.hand_over(batch, [epoch]);
             }
@@ -68,6 +71,11 @@ impl Check for Closed {
 
     fn see(&mut self, robot: usize, seen: &Seen<'_>) -> Result<(), String> {
         match seen {
+            Seen::Heard(bytes) => {
+                let heard = &mut self.returned.entry(robot).or_default().heard;
+                heard.clear();
+                heard.extend_from_slice(bytes);
+            }
             Seen::Started(id) => self.returned.entry(robot).or_default().robot = Some(*id),
             // A disk that lost what its writer knew cannot know which epochs were closed.
             Seen::MayFork(origin) => {
@@ -101,6 +109,10 @@ impl Check for Closed {
     }
 }
 
+fn contains(message: &[u8], entry: &[u8]) -> bool {
+    !entry.is_empty() && message.windows(entry.len()).any(|part| part == entry)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -116,6 +128,13 @@ mod tests {
         let id = EntryId { frame: FrameId { robot: ME, epoch }, seq };
         let records = vec![Record::Entry { id, bytes: vec![epoch as u8, seq as u8] }];
         check.see(robot, &Seen::Output(&Output::Persist { batch: 1, records }))
+    }
+
+    /// An own entry comes back, in the midst of a message.
+    fn comes_back(check: &mut Closed, epoch: u32, seq: u32) -> Result<(), String> {
+        check.see(0, &Seen::Heard(&[0, epoch as u8, seq as u8, 0]))?;
+        persist(check, epoch, seq)?;
+        check.see(0, &Seen::Heard(&[]))
     }
 
     #[test]
@@ -143,7 +162,7 @@ mod tests {
             assert!(persist_at(1, &mut check, 5, 0).is_ok(), "a peer has it");
             check.see(0, &excused).unwrap();
             check.see(0, &Seen::Wiped).unwrap();
-            assert!(persist(&mut check, 5, 0).is_ok(), "it comes back");
+            assert!(comes_back(&mut check, 5, 0).is_ok());
             assert_eq!(persist(&mut check, 5, 2).is_ok(), forges);
             assert!(persist(&mut check, 6, 0).is_ok());
         }
@@ -156,7 +175,7 @@ mod tests {
             check.see(0, &Seen::Started(ME)).unwrap();
             assert!(persist(&mut check, 5, 0).is_ok() && persist_at(1, &mut check, 5, 0).is_ok());
             check.see(0, &Seen::Wiped).unwrap();
-            assert!(persist(&mut check, 5, 0).is_ok(), "it comes back");
+            assert!(comes_back(&mut check, 5, 0).is_ok());
             if durable {
                 check.see(0, &Seen::Durable(1)).unwrap();
             }
@@ -176,6 +195,18 @@ mod tests {
         check.see(0, &Seen::Died).unwrap();
         check.see(0, &Seen::Started(ME)).unwrap();
         assert!(persist(&mut check, 5, 1).is_ok() && persist(&mut check, 5, 2).is_ok());
+    }
+
+    /// The same alignment is refused once more in the same words, of a peer's disk the first time.
+    #[test]
+    fn what_is_written_once_more_after_an_old_image_does_not_come_back() {
+        let mut check = Closed::default();
+        check.see(0, &Seen::Started(ME)).unwrap();
+        assert!(persist(&mut check, 5, 0).is_ok() && persist_at(1, &mut check, 5, 0).is_ok());
+        check.see(0, &Seen::MayFork(ME)).unwrap();
+        check.see(0, &Seen::Damaged).unwrap();
+        assert!(check.see(0, &Seen::Heard(&[9, 9, 9])).is_ok() && persist(&mut check, 5, 0).is_ok());
+        assert!(persist(&mut check, 5, 1).is_ok());
     }
 
     #[test]

@@ -53,6 +53,8 @@ pub trait Check {
 pub enum Seen<'a> {
     /// The process of this robot started.
     Started(RobotId),
+    /// It is about to handle a message of these bytes, or something else: then there are none.
+    Heard(&'a [u8]),
     /// A peer's question was put to it under this token.
     Asked(u64),
     /// It made an output.

@@ -205,14 +205,17 @@ impl<C: Core> Swarm<C> {
 
     /// Hands one input to a robot's core and acts on what comes out.
     pub(super) fn feed(&mut self, now: Instant, robot: usize, input: Input) {
-        let one = &mut self.robots[robot];
-        let local = one.local(now);
-        let Some(core) = one.core.as_mut() else {
+        if self.robots[robot].core.is_none() {
             self.counts.to_the_dead += 1;
             return;
-        };
+        }
         self.trace.input(now, robot, &input);
-        self.stopwatch.time("handle", || core.handle(local, input));
+        self.see(robot, &Seen::Heard(message(&input)));
+        let one = &mut self.robots[robot];
+        let local = one.local(now);
+        if let Some(core) = one.core.as_mut() {
+            self.stopwatch.time("handle", || core.handle(local, input));
+        }
         self.drain(now, robot);
     }
 
@@ -339,5 +342,15 @@ fn answer_name(kind: QueryKind) -> &'static str {
         QueryKind::Sync => "sync answer",
         QueryKind::Blob => "blob answer",
         QueryKind::Align => "align answer",
+    }
+}
+
+/// The bytes of an input that is a message.
+fn message(input: &Input) -> &[u8] {
+    match input {
+        Input::Received { bytes, .. } | Input::Asked { bytes, .. } | Input::Answered { bytes: Some(bytes), .. } => {
+            bytes
+        }
+        _ => &[],
     }
 }
