@@ -5,6 +5,7 @@
 //! 180°, poses in m and rad. What lies beyond [`RANGE_M`] is left out, and with it readings that stand for no return.
 
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use crate::line_error::LineError;
 use crate::submap::{CovarianceOf, Keyframe};
 use crate::time::Stamp;
 use core::f64::consts::PI;
@@ -48,14 +49,7 @@ pub struct Scan {
 }
 
 /// A line that cannot be used, and how to mend it.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[error("line {line}: {what}")]
-pub struct CarmenError {
-    /// Which line, from 1.
-    pub line: usize,
-    /// What is wrong with it.
-    pub what: BadLine,
-}
+pub type CarmenError = LineError<BadLine>;
 
 /// What is wrong with a line.
 #[derive(Clone, Debug, Error, PartialEq)]

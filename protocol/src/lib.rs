@@ -23,6 +23,7 @@ pub mod estimate;
 pub mod geometry;
 pub mod gossip;
 pub mod ids;
+pub mod line_error;
 pub mod mrclam;
 pub mod recording;
 pub mod replica;

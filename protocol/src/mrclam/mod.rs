@@ -12,6 +12,7 @@ mod smooth;
 
 pub use front::{Calibration, keyframes};
 
+use crate::line_error::LineError;
 use crate::time::Stamp;
 use std::collections::BTreeMap;
 use thiserror::Error;
@@ -30,14 +31,7 @@ const SECONDS_MAX: f64 = 9e9;
 const SPEED_MAX: f64 = 100.0;
 
 /// A line that cannot be used, and how to mend it.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[error("line {line}: {what}")]
-pub struct MrclamError {
-    /// Which line, from 1.
-    pub line: usize,
-    /// What is wrong with it.
-    pub what: BadLine,
-}
+pub type MrclamError = LineError<BadLine>;
 
 /// What is wrong with a line.
 #[derive(Clone, Debug, Error, PartialEq)]

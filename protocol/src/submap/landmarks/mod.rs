@@ -13,6 +13,8 @@
 
 mod chart;
 mod describe;
+#[cfg(test)]
+mod drive_tests;
 mod flat;
 mod gather;
 mod register;
