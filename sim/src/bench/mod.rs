@@ -2,10 +2,12 @@
 
 pub mod corr;
 pub mod cpu;
+mod fit;
 pub mod flood;
 pub mod frames;
 pub mod gossip;
 pub mod graph;
+pub mod mission;
 pub mod outliers;
 pub mod peer;
 pub mod peers;
@@ -54,6 +56,12 @@ pub enum Bench {
     /// The same swarm of real agents runs without and with 10,000 messages of strangers a second at two of its robots,
     /// for 60 s; its halves heal meanwhile. Exit code 1 if it is more than twice as slow, or grows by 16 MB.
     Flood(flood::Flood),
+    /// Robots that drive for minutes: when they merge, how far off their map is, and what they send
+    ///
+    /// Scans are ray-cast, so this takes a while: about twice the time driven, for ten robots. Exit code 1 if robots that
+    /// see the same take more than 60 s to merge, the map errs by more than 1.1 times that of a solver given every true
+    /// loop, or a robot sends more than 1 kB/s.
+    Mission(mission::Mission),
     /// Frame-level consensus on seeded worlds: success, refusals and honesty of the covariance
     ///
     /// Two robots drive a figure-eight of about 120 m with drifting odometry; a cell has 20 alignments between them, of
@@ -80,6 +88,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Places(options) => places::run(&options),
         Bench::Share(options) => share::run(&options),
         Bench::Flood(options) => flood::run(&options),
+        Bench::Mission(options) => mission::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }
 }

@@ -1,22 +1,15 @@
 //! How far estimated poses are from others, and whether their covariances say so.
 
+use crate::bench::fit::rms_after_fit;
 use merganser_protocol::geometry::{PoseWithCovariance, Se3};
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 use std::collections::BTreeMap;
 
 /// RMS distance of positions after the best rigid alignment.
 pub(super) fn ate(reference: &BTreeMap<u64, Se3>, found: &BTreeMap<u64, Se3>) -> f64 {
     let pairs: Vec<(Vector3<f64>, Vector3<f64>)> =
         found.iter().filter_map(|(id, t)| Some((reference.get(id)?.translation, t.translation))).collect();
-    let n = pairs.len().max(1) as f64;
-    let (a, b) =
-        (pairs.iter().map(|p| p.0).sum::<Vector3<f64>>() / n, pairs.iter().map(|p| p.1).sum::<Vector3<f64>>() / n);
-    let cross: Matrix3<f64> = pairs.iter().map(|(x, y)| (x - a) * (y - b).transpose()).sum();
-    let svd = cross.svd(true, true);
-    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else { return f64::NAN };
-    let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
-    let rotation = u * flip * v_t;
-    (pairs.iter().map(|(x, y)| (x - a - rotation * (y - b)).norm_squared()).sum::<f64>() / n).sqrt()
+    rms_after_fit(&pairs)
 }
 
 /// Mean normalised squared error of poses relative to the smallest one, by the degrees of freedom: 1 for honest

@@ -1,0 +1,189 @@
+//! `merganser-sim bench mission`: a swarm that drives for minutes with ray-cast scans, as it would be used. When do robots
+//! merge that see the same, how far off is the map at the end beside that of a solver who is given every true loop, and
+//! what does each robot send for it?
+
+mod anchors;
+mod oracle;
+
+use crate::bar::progress_bar;
+use crate::bench::table::median;
+use crate::scenario::Scenario;
+use crate::swarm::{Outcome, Swarm};
+use anchors::{Anchor, anchors, errors};
+use anyhow::{Context, ensure};
+use clap::Args;
+use merganser_protocol::agent::Agent;
+use merganser_protocol::agent::io::Event;
+use merganser_protocol::snapshot::Snapshot;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Write;
+
+/// The hall, the sensor and the configuration.
+const SCENARIO: &str = include_str!("../../../scenarios/ten.toml");
+/// Two submaps whose anchors are no farther apart overlap for certain, m: the sensor looks all around, 15 m far.
+const OVERLAP_M: f64 = 3.0;
+/// Longest time from an overlap to the merge, s.
+const MERGE_SECS_MAX: f64 = 60.0;
+/// Largest absolute trajectory error beside that of the solver given every true loop.
+const RATIO_MAX: f64 = 1.1;
+/// Most that a robot sends, bytes per second.
+const SENT_MAX: f64 = 1000.0;
+
+/// `bench mission`.
+#[derive(Debug, Args)]
+pub struct Mission {
+    /// Robots
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u16).range(2..=50))]
+    robots: u16,
+    /// Time driven, s
+    #[arg(long, default_value_t = 600, value_parser = clap::value_parser!(u32).range(10..=7200))]
+    secs: u32,
+    /// What world, drives and noise are drawn from
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..1 << 62))]
+    seed: u64,
+}
+
+/// Measures and prints. Returns whether all goals were reached.
+///
+/// # Errors
+/// Standard output that cannot be written, a scenario that does not start.
+pub fn run(options: &Mission) -> anyhow::Result<bool> {
+    let mut scenario = Scenario::parse(SCENARIO)?;
+    (scenario.robots, scenario.duration_secs) = (usize::from(options.robots), f64::from(options.secs));
+    let swarm = Swarm::<Agent>::new(scenario, options.seed)?;
+    let bar = progress_bar(swarm.end().as_secs_f64() as u64, "virtual s")?;
+    let outcome = swarm.run(|now| bar.set_position(now.as_secs_f64() as u64));
+    bar.finish_and_clear();
+    let outcome = outcome?;
+    if let Some(violation) = &outcome.violation {
+        anyhow::bail!("{} at {:.1} s: {}", violation.invariant, violation.at_secs, violation.what);
+    }
+    let snapshot = outcome.robots.first().and_then(|robot| robot.snapshot.as_ref()).context("no robot is left")?;
+    let anchors = anchors(&outcome, snapshot)?;
+    let mut out = std::io::stdout().lock();
+    let used = snapshot.graph.edges.iter().filter(|edge| edge.weight > 0.0).count();
+    writeln!(
+        out,
+        "{} robots, {} s, seed {}: {} submaps, {} alignments stated, {used} used",
+        options.robots,
+        options.secs,
+        options.seed,
+        anchors.len(),
+        snapshot.graph.edges.len()
+    )?;
+    let merged = merges(&outcome, &anchors, &mut out)?;
+    let accurate = accuracy(&outcome, snapshot, &anchors, &mut out)?;
+    let frugal = traffic(&outcome, &mut out)?;
+    Ok(merged && accurate && frugal)
+}
+
+/// From the first overlap of any two robots to the moment at which both had merged.
+fn merges(outcome: &Outcome<Agent>, anchors: &[Anchor], out: &mut impl Write) -> anyhow::Result<bool> {
+    let finished = finished(outcome);
+    let mut overlaps: BTreeMap<(usize, usize), f64> = BTreeMap::new();
+    for (k, a) in anchors.iter().enumerate() {
+        for b in anchors[k + 1..].iter().filter(|b| b.robot != a.robot && a.is_near(b, OVERLAP_M)) {
+            let Some(at) = finished.get(&(a.robot, a.index)).zip(finished.get(&(b.robot, b.index))) else { continue };
+            let first = overlaps.entry((a.robot.min(b.robot), a.robot.max(b.robot))).or_insert(f64::INFINITY);
+            *first = first.min(at.0.max(*at.1));
+        }
+    }
+    let since = merged_since(outcome);
+    let waits: Vec<f64> = overlaps
+        .iter()
+        .map(|(&(a, b), overlap)| {
+            let both = [(a, b), (b, a)].map(|pair| since.get(&pair).copied().unwrap_or(f64::INFINITY));
+            (both[0].max(both[1]) - overlap).max(0.0)
+        })
+        .collect();
+    let worst = waits.iter().copied().fold(0.0, f64::max);
+    writeln!(
+        out,
+        "pairs of robots that saw the same: {}; from that to both having merged: median {:.1} s, at most {worst:.1} s \
+         (goal {MERGE_SECS_MAX} s)",
+        waits.len(),
+        median(waits.clone())
+    )?;
+    Ok(worst <= MERGE_SECS_MAX)
+}
+
+/// When each submap was finished, s.
+fn finished(outcome: &Outcome<Agent>) -> BTreeMap<(usize, u32), f64> {
+    let submap = |(at, robot, event): &(f64, usize, Event)| match event {
+        Event::SubmapFinished { submap, .. } => Some(((*robot, submap.index), *at)),
+        _ => None,
+    };
+    outcome.told.iter().filter_map(submap).collect()
+}
+
+/// Since when each robot has had each other's frame in its own, for good.
+fn merged_since(outcome: &Outcome<Agent>) -> BTreeMap<(usize, usize), f64> {
+    let frames: BTreeMap<_, usize> = outcome
+        .told
+        .iter()
+        .filter_map(|(_, robot, event)| match event {
+            Event::SubmapFinished { submap, .. } => Some((submap.frame, *robot)),
+            _ => None,
+        })
+        .collect();
+    let mut since = BTreeMap::new();
+    for (at, robot, event) in &outcome.told {
+        match event {
+            Event::Merged { frame } => frames.get(frame).map(|other| since.insert((*robot, *other), *at)),
+            Event::Unmerged { frame } => frames.get(frame).map(|other| since.remove(&(*robot, *other))),
+            _ => None,
+        };
+    }
+    since
+}
+
+/// The map's error beside that of a solver who is given every true loop, and that of odometry.
+fn accuracy(
+    outcome: &Outcome<Agent>,
+    snapshot: &Snapshot,
+    anchors: &[Anchor],
+    out: &mut impl Write,
+) -> anyhow::Result<bool> {
+    let joined = anchors.iter().filter(|anchor| anchor.t_own_anchor.is_some()).count();
+    ensure!(joined > 0, "no submap is in the map");
+    let ours = errors(anchors, |anchor| anchor.t_own_anchor);
+    let sigmas = oracle::sigmas(snapshot, anchors).context("no alignment is used")?;
+    let loops = oracle::loops(anchors, OVERLAP_M);
+    let best = oracle::solve(outcome, anchors, &loops, sigmas)?;
+    let theirs = errors(anchors, |anchor| best.get(&(anchor.robot, anchor.index)).copied());
+    let robots: BTreeSet<usize> = anchors.iter().map(|anchor| anchor.robot).collect();
+    let alone = robots.iter().map(|robot| {
+        let own: Vec<Anchor> = anchors.iter().filter(|anchor| anchor.robot == *robot).cloned().collect();
+        errors(&own, |anchor| Some(anchor.t_frame_anchor))
+    });
+    writeln!(
+        out,
+        "absolute trajectory error: {ours:.4} m ({joined} of {} submaps in one map); given every true loop ({}, with our \
+         errors of {:.3} m and {:.2}°): {theirs:.4} m; ratio {:.2} (goal {RATIO_MAX}); odometry of each alone: {:.3} m",
+        anchors.len(),
+        loops.len(),
+        sigmas.0,
+        sigmas.1.to_degrees(),
+        ours / theirs,
+        median(alone.collect()),
+    )?;
+    Ok(joined == anchors.len() && ours <= RATIO_MAX * theirs)
+}
+
+/// What each robot sent.
+fn traffic(outcome: &Outcome<Agent>, out: &mut impl Write) -> anyhow::Result<bool> {
+    let secs = outcome.ended.as_secs_f64();
+    let mut of_kind: BTreeMap<&str, f64> = BTreeMap::new();
+    for (kind, usage) in outcome.usage.iter().flatten() {
+        *of_kind.entry(kind).or_default() += usage.bytes as f64 / secs / outcome.usage.len() as f64;
+    }
+    let of_robot = outcome.usage.iter().map(|kinds| kinds.values().map(|u| u.bytes).sum::<u64>() as f64 / secs);
+    let (mean, most) = (of_kind.values().sum::<f64>(), of_robot.fold(0.0, f64::max));
+    let kinds: Vec<String> = of_kind.iter().map(|(kind, bytes)| format!("{kind} {bytes:.0}")).collect();
+    writeln!(
+        out,
+        "sent by a robot: {mean:.0} B/s, at most {most:.0} (goal {SENT_MAX:.0}) over {secs:.0} s: {}",
+        kinds.join(", ")
+    )?;
+    Ok(most <= SENT_MAX)
+}
