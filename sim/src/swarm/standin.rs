@@ -53,6 +53,10 @@ impl StandIn {
     }
 
     fn align(&self, name: &str, lies: bool, job: &AlignJob) -> Result<Measured, RefusalReason> {
+        // Nothing tells one submap without keypoints from another, here or anywhere.
+        if job.theirs.is_empty() || job.mine.is_empty() {
+            return Err(RefusalReason::NoConsensus);
+        }
         let theirs = self.anchors.get(&Hash::of(&job.theirs.encode())).ok_or(RefusalReason::BadInput)?;
         let mine = self.anchors.get(&Hash::of(&job.mine.encode())).ok_or(RefusalReason::BadInput)?;
         let truth = mine.inverse() * *theirs;
@@ -72,5 +76,56 @@ impl StandIn {
         let covariance = Covariance::from_sigmas(sigmas).map_err(|_| RefusalReason::BadInput)?;
         let t_mine_theirs = Relative::Metric(PoseWithCovariance { pose, covariance });
         Ok(Measured { t_mine_theirs, sigma: t, support: 40.0, log10_nfa: -20.0 })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use merganser_protocol::agent::job::DescribeJob;
+    use merganser_protocol::config::{AlignConfig, Sensor, SubmapConfig};
+    use merganser_protocol::submap::{CovarianceOf, Described, Keyframe, SubmapBuilder};
+    use merganser_protocol::time::Stamp;
+    use merganser_protocol::wire::fact::ScaleKind;
+    use std::sync::Arc;
+
+    /// Describes a scan of so many points on a wall, made at `x`.
+    fn described(standin: &mut StandIn, points: usize, x: f64) -> Described {
+        let config = SubmapConfig::default();
+        let mut builder = SubmapBuilder::new(config.clone());
+        let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
+        let pose = PoseWithCovariance { pose: Se3::identity(), covariance };
+        let at = |k: usize| [2.0, 0.2 * (k % 20) as f32, 0.2 * (k / 20) as f32 + 0.01 * x as f32];
+        let points = (0..points).map(at).collect();
+        let keyframe = Keyframe { stamp: Stamp(1), pose, covariance_of: CovarianceOf::Motion, points, marks: vec![] };
+        builder.push(keyframe).unwrap();
+        let job = Job::Describe(Box::new(DescribeJob { submap: builder.flush().unwrap(), config }));
+        let there = Se3::new(Se3::identity().rotation, [x, 0.0, 0.0].into());
+        match standin.run("alpha", job, |_| Some(there)).0 {
+            JobResult::Described(described) => described.1,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn submaps_without_keypoints_align_with_nothing() {
+        for (points, aligned) in [(1, false), (400, true)] {
+            let mut standin = StandIn::new(SummaryOptions::default(), 1);
+            let [mine, theirs] = [0.0, 2.0].map(|x| described(&mut standin, points, x));
+            let job = AlignJob {
+                theirs: Arc::new(theirs.keypoints),
+                mine: Arc::new(mine.features),
+                back: None,
+                config: AlignConfig::default(),
+                voxel_m: 0.1,
+                sensor: Sensor::Points3d,
+                scale: ScaleKind::Metric,
+                seed: 1,
+            };
+            let JobResult::Aligned(answer) = standin.run("alpha", Job::Align(Box::new(job)), |_| None).0 else {
+                panic!("not aligned")
+            };
+            assert_eq!(answer.is_ok(), aligned, "{points} points");
+        }
     }
 }
