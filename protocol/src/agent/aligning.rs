@@ -5,7 +5,9 @@ use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Look, Measured};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
-use super::negotiation::{FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work};
+use super::negotiation::{
+    FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, TRIES_PER_SUBMAP_TIED, VERIFICATIONS_MAX, Work,
+};
 use super::shortlist::Candidate;
 use super::stated::Stated;
 use crate::config::AlignConfig;
@@ -20,6 +22,10 @@ use std::sync::Arc;
 
 /// When a fetch is looked at again that nobody can serve now.
 const FETCH_AGAIN: Duration = Duration::from_millis(500);
+
+/// Two frames that are tied well enough as such are aligned further where a submap has drifted from the other by this many
+/// standard deviations of an alignment.
+const NEWS_MIN: f64 = 1.0;
 
 impl Agent {
     /// A fact has taken effect: what does it call for?
@@ -154,29 +160,47 @@ impl Agent {
         let mut stated = Stated::default();
         for (id, fact) in self.knowledge.alignments() {
             if self.knowledge.agreement(id) != Agreement::Disputed {
-                stated.count((fact.i, fact.j));
+                stated.count((fact.i, fact.j), &fact.t_i_j);
             }
         }
         stated
     }
 
-    /// Expected gain of a pair: unmerged frames first, then similarity; nothing where the joint estimate says that the
-    /// two submaps cannot touch, or where another alignment of theirs would say too little.
+    /// Expected gain of a pair: unmerged frames first, then where the two submaps are alike and least is known of how they
+    /// lie; nothing where the joint estimate says that they cannot touch, or where another alignment of theirs would say
+    /// too little.
     fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
         let (a, b) = pair_of(candidate.mine, candidate.theirs);
         let is_loop = self.is_loop(candidate.mine, candidate.theirs);
         if self.is_out_of_reach(candidate.theirs) || (is_loop && self.is_out_of_reach(candidate.mine)) {
             return None;
         }
-        if stated.is_enough((a, b), self.config.estimate.alignments_min) {
+        if stated.has_said_enough((a, b), self.config.estimate.alignments_min) {
             return None;
         }
-        let wish = if candidate.wished { 0.5 } else { 0.0 };
-        match self.distance(a, b) {
-            None => Some(1.0 + candidate.similarity + wish),
-            Some(distance) if distance <= self.reach(a) + self.reach(b) => Some(candidate.similarity + wish),
-            Some(_) => None,
+        let worth = candidate.similarity + if candidate.wished { 0.5 } else { 0.0 };
+        let tied = stated.tied((a, b));
+        let Some((distance, drift)) = self.distance(a, b).zip(self.drift_between(a, b)) else {
+            return tied.is_none().then_some(1.5 + worth);
+        };
+        if distance > self.reach(a) + self.reach(b) {
+            return None;
         }
+        let Some(sigma) = tied else { return Some(worth) };
+        let news = drift / sigma;
+        if self.negotiation.tries(candidate) >= TRIES_PER_SUBMAP_TIED || news < NEWS_MIN {
+            return None;
+        }
+        // Loops of our own come first: they cost no radio.
+        let share = if is_loop { 1.0 } else { news / (1.0 + news) };
+        Some(0.5 * worth * share)
+    }
+
+    /// The least by which the joint estimate may have misplaced the two anchors against one another, RMS over its axes: the
+    /// difference of what it may have misplaced either by, in our frame.
+    fn drift_between(&self, a: SubmapId, b: SubmapId) -> Option<f64> {
+        let sigma = |id| self.map.solved.anchors.get(&id).map(|t: &Relative| t.translation_variance().sqrt());
+        Some((sigma(a)? - sigma(b)?).abs())
     }
 
     /// Nobody in reach has the submap's keypoints.

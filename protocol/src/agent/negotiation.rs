@@ -2,9 +2,11 @@
 //!
 //! A hash of the pair decides the responsible endpoint, so exactly one begins. Candidates are ranked by expected gain:
 //! pairs of frames that are not merged yet first, then by similarity of the summaries. Pairs that the joint estimate
-//! places out of reach of one another, frame pairs that already have [`ALIGNMENTS_PER_FRAME_PAIR`] alignments, and
-//! submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant. Every pair is tried once; every foreign
-//! alignment that names us is verified once.
+//! places out of reach of one another, and submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant.
+//! Two frames with [`ALIGNMENTS_PER_FRAME_PAIR`] alignments are tied well enough as such; after that only submaps are
+//! aligned that have drifted from one another by the joint estimate, a robot's own first, which cost no radio: without
+//! these the map of a long drive would become that of its odometry. Every pair is tried once; every foreign alignment that
+//! names us is verified once.
 
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
@@ -16,13 +18,15 @@ use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Undisputed alignments between two frames beyond which no further pair is tried.
+/// Undisputed alignments between two frames beyond which a further pair must tell something new.
 pub const ALIGNMENTS_PER_FRAME_PAIR: usize = 12;
 /// Undisputed alignments of one submap with one other frame beyond which it is tried with no more of that frame's: they
 /// share the submap's errors, so that others tell more.
 pub const ALIGNMENTS_PER_SUBMAP: usize = 3;
 /// Pairs tried for one own submap against one foreign frame.
 pub const TRIES_PER_SUBMAP: usize = 12;
+/// Of these, once the two frames are tied well enough as such: what drifts is seen from the next submap as well.
+pub const TRIES_PER_SUBMAP_TIED: usize = 3;
 /// Index distance from which two submaps of one frame may close a loop.
 pub const LOOP_GAP: u32 = 5;
 /// Decoded keypoint blobs kept in memory.
@@ -206,12 +210,17 @@ impl Negotiation {
         }
     }
 
+    /// Pairs tried so far of this one's own submap with this one's other frame.
+    pub fn tries(&self, candidate: &Candidate) -> usize {
+        self.tries.get(&(candidate.mine, candidate.theirs.frame)).copied().unwrap_or(0)
+    }
+
     /// Candidates with an expected gain, best first. `gain` answers `None` for a pair that is dormant now.
     pub fn ranked(&self, gain: impl Fn(&Candidate) -> Option<f64>) -> Vec<Candidate> {
         let mut ranked: Vec<(f64, Pair, Candidate)> = self
             .candidates
             .iter()
-            .filter(|(_, c)| self.tries.get(&(c.mine, c.theirs.frame)).is_none_or(|&n| n < TRIES_PER_SUBMAP))
+            .filter(|(_, c)| self.tries(c) < TRIES_PER_SUBMAP)
             .filter_map(|(pair, c)| gain(c).map(|g| (g, pair, *c)))
             .collect();
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));

@@ -2,39 +2,62 @@
 
 use super::knowledge::Pair;
 use super::negotiation::{ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP};
+use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use std::collections::BTreeMap;
 
 /// Undisputed alignments.
 #[derive(Default)]
 pub(super) struct Stated {
-    of_frames: BTreeMap<(FrameId, FrameId), usize>,
+    of_frames: BTreeMap<(FrameId, FrameId), OfFrames>,
     /// Of one submap with another frame (or with its own).
     of_submap: BTreeMap<(SubmapId, FrameId), usize>,
 }
 
+/// Those between two frames.
+#[derive(Default)]
+struct OfFrames {
+    count: usize,
+    /// Of the variances of their translations, summed over the axes.
+    variance: f64,
+}
+
 impl Stated {
     /// Adds an alignment of `i` and `j`, in canonical order.
-    pub(super) fn count(&mut self, (i, j): Pair) {
-        *self.of_frames.entry((i.frame, j.frame)).or_default() += 1;
+    pub(super) fn count(&mut self, (i, j): Pair, t_i_j: &Relative) {
+        let of_frames = self.of_frames.entry((i.frame, j.frame)).or_default();
+        of_frames.count += 1;
+        of_frames.variance += t_i_j.translation_variance();
         *self.of_submap.entry((i, j.frame)).or_default() += 1;
         *self.of_submap.entry((j, i.frame)).or_default() += 1;
     }
 
-    /// One more of this pair would say too little: the frames are tied well enough, or one of the submaps has said enough,
-    /// which is never less than the `alignments_min` that it takes to merge.
-    pub(super) fn is_enough(&self, (i, j): Pair, alignments_min: usize) -> bool {
+    /// One of the submaps has said enough of the other's frame, which is never less than the `alignments_min` that it takes
+    /// to merge.
+    pub(super) fn has_said_enough(&self, (i, j): Pair, alignments_min: usize) -> bool {
         let of_submap = |id, other| self.of_submap.get(&(id, other)).copied().unwrap_or(0);
-        let of_frames = self.of_frames.get(&(i.frame, j.frame)).copied().unwrap_or(0);
         let most = of_submap(i, j.frame).max(of_submap(j, i.frame));
-        of_frames >= ALIGNMENTS_PER_FRAME_PAIR || most >= ALIGNMENTS_PER_SUBMAP.max(alignments_min)
+        most >= ALIGNMENTS_PER_SUBMAP.max(alignments_min)
+    }
+
+    /// Where two frames are tied well enough as such: standard deviation of the translation of an alignment of theirs, over
+    /// all axes, in the mean.
+    pub(super) fn tied(&self, (i, j): Pair) -> Option<f64> {
+        let of_frames = self.of_frames.get(&(i.frame, j.frame)).filter(|of| of.count >= ALIGNMENTS_PER_FRAME_PAIR)?;
+        Some((of_frames.variance / of_frames.count as f64).sqrt())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::{Covariance, PoseWithCovariance, Se3};
     use crate::ids::RobotId;
+
+    fn measured(sigma: f64) -> Relative {
+        let covariance = Covariance::from_sigmas([sigma; 6]).unwrap();
+        Relative::Metric(PoseWithCovariance { pose: Se3::identity(), covariance })
+    }
 
     fn submap(robot: u8, index: u32) -> SubmapId {
         SubmapId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 1 }, index }
@@ -46,12 +69,12 @@ mod tests {
             let limit = ALIGNMENTS_PER_SUBMAP.max(alignments_min) as u32;
             let mut stated = Stated::default();
             for n in 0..limit {
-                assert!(!stated.is_enough((submap(1, 0), submap(2, 99)), alignments_min), "{n}");
-                stated.count((submap(1, 0), submap(2, n)));
+                assert!(!stated.has_said_enough((submap(1, 0), submap(2, 99)), alignments_min), "{n}");
+                stated.count((submap(1, 0), submap(2, n)), &measured(0.1));
             }
-            assert!(stated.is_enough((submap(1, 0), submap(2, 99)), alignments_min));
-            assert!(!stated.is_enough((submap(1, 0), submap(3, 0)), alignments_min), "another frame");
-            assert!(!stated.is_enough((submap(1, 1), submap(2, 0)), alignments_min), "another submap");
+            assert!(stated.has_said_enough((submap(1, 0), submap(2, 99)), alignments_min));
+            assert!(!stated.has_said_enough((submap(1, 0), submap(3, 0)), alignments_min), "another frame");
+            assert!(!stated.has_said_enough((submap(1, 1), submap(2, 0)), alignments_min), "another submap");
         }
     }
 
@@ -59,9 +82,12 @@ mod tests {
     fn two_frames_are_tied_well_enough_at_their_limit_and_not_before() {
         let mut stated = Stated::default();
         for n in 0..ALIGNMENTS_PER_FRAME_PAIR as u32 {
-            assert!(!stated.is_enough((submap(1, 99), submap(2, 99)), 3), "{n}");
-            stated.count((submap(1, n), submap(2, n)));
+            assert_eq!(stated.tied((submap(1, 99), submap(2, 99))), None, "{n}");
+            stated.count((submap(1, n), submap(2, n)), &measured(if n % 2 == 0 { 0.1 } else { 0.2 }));
         }
-        assert!(stated.is_enough((submap(1, 99), submap(2, 99)), 3));
+        let sigma = stated.tied((submap(1, 99), submap(2, 99))).unwrap();
+        // Three axes, half of the alignments with either.
+        assert!((sigma - (3.0 * 0.5 * (0.01 + 0.04f64)).sqrt()).abs() < 1e-6, "{sigma}");
+        assert_eq!(stated.tied((submap(1, 99), submap(3, 99))), None);
     }
 }

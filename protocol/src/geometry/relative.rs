@@ -60,6 +60,14 @@ impl Relative {
         }
     }
 
+    /// Variance of the translation, summed over its axes.
+    pub fn translation_variance(&self) -> f64 {
+        match self {
+            Self::Metric(p) => p.covariance.matrix().fixed_view::<3, 3>(0, 0).trace(),
+            Self::Similarity(s) => s.covariance.matrix().fixed_view::<3, 3>(0, 0).trace(),
+        }
+    }
+
     /// The rigid measurement, where it is one.
     pub fn metric(&self) -> Option<&PoseWithCovariance> {
         match self {

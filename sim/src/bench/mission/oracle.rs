@@ -4,7 +4,7 @@
 use super::anchors::Anchor;
 use crate::dice::Dice;
 use crate::swarm::Outcome;
-use crate::truth::rigid;
+use crate::truth::{rigid, square};
 use anyhow::Context;
 use merganser_protocol::agent::Agent;
 use merganser_protocol::config::EstimateConfig;
@@ -21,10 +21,16 @@ const LOOPS_PER_SUBMAP: usize = 6;
 /// Submaps of one robot so near in its chain are no loop.
 const LOOP_GAP: u32 = 5;
 
-/// Root mean square errors, m and rad and per axis, of the alignments that the swarm uses.
-pub(super) fn sigmas(snapshot: &Snapshot, anchors: &[Anchor]) -> Option<(f64, f64)> {
+/// Root mean square errors of the alignments that the swarm uses, m and rad and per axis, and what they count as.
+pub(super) struct Errors {
+    pub(super) true_ones: (f64, f64),
+    pub(super) claimed: (f64, f64),
+}
+
+/// Of all alignments that the swarm uses; `None` for none.
+pub(super) fn alignment_errors(snapshot: &Snapshot, anchors: &[Anchor]) -> Option<Errors> {
     let names: BTreeMap<&str, &Se3> = anchors.iter().map(|a| (a.name.as_str(), &a.t_world_anchor)).collect();
-    let (mut squares, mut count) = ((0.0, 0.0), 0.0);
+    let (mut squares, mut claimed, mut count) = ((0.0, 0.0), (0.0, 0.0), 0.0);
     for edge in snapshot.graph.edges.iter().filter(|edge| edge.weight > 0.0) {
         let ends = [&edge.i, &edge.j].map(|name| names.get(name.as_str()));
         let ([Some(i), Some(j)], Some(t)) = (ends, rigid(&edge.t_i_j.pose)) else {
@@ -33,9 +39,13 @@ pub(super) fn sigmas(snapshot: &Snapshot, anchors: &[Anchor]) -> Option<(f64, f6
         let off = t.local(&(i.inverse() * **j));
         squares.0 += off.fixed_rows::<3>(0).norm_squared() / 3.0;
         squares.1 += off.fixed_rows::<3>(3).norm_squared() / 3.0;
+        let variances = square::<6>(&edge.t_i_j.covariance).diagonal() / edge.weight;
+        claimed.0 += variances.fixed_rows::<3>(0).mean();
+        claimed.1 += variances.fixed_rows::<3>(3).mean();
         count += 1.0;
     }
-    (count > 0.0).then(|| ((squares.0 / count).sqrt(), (squares.1 / count).sqrt()))
+    let root = |sums: (f64, f64)| ((sums.0 / count).sqrt(), (sums.1 / count).sqrt());
+    (count > 0.0).then(|| Errors { true_ones: root(squares), claimed: root(claimed) })
 }
 
 /// Pairs of anchors that overlap.
