@@ -58,8 +58,8 @@ pub struct MapProblem {
     /// Direct measurements of other robots.
     pub sightings: Vec<AgreedAlignment>,
     /// Alignments that count in the joint estimate with less than their whole information, because they have errors in
-    /// common with those of other pairs of frames: over 0 to 1, at least `SHARE_MIN` (1e-6); 1 for what is
-    /// not listed.
+    /// common with those of other pairs of frames: over 0 to 1, at least `SHARE_MIN` (1e-6); 1 for what is not
+    /// listed.
     pub shares: BTreeMap<EntryId, f64>,
 }
 
