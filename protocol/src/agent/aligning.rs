@@ -196,8 +196,8 @@ impl Agent {
         Some(0.5 * worth * share)
     }
 
-    /// The least that the standard deviation of the two anchors' distance vector can be, summed over its axes, in the unit
-    /// of our frame: the difference of those of their positions there (triangle inequality in L²), whatever they share.
+    /// The least that the standard deviation of the two anchors' distance vector can be, over all axes, where all frames
+    /// have our unit: the difference of those of their positions (triangle inequality in L²), whatever they share.
     fn drift_between(&self, a: SubmapId, b: SubmapId) -> Option<f64> {
         let sigma = |id| self.map.solved.anchors.get(&id).map(|t: &Relative| t.translation_variance().sqrt());
         Some((sigma(a)? - sigma(b)?).abs())

@@ -60,7 +60,7 @@ impl Relative {
         }
     }
 
-    /// Variance of the translation, summed over its axes, in the squared unit of the target frame.
+    /// Variance of the translation, of the local perturbation summed over its axes, in the squared unit of the source.
     pub fn translation_variance(&self) -> f64 {
         match self {
             Self::Metric(p) => p.covariance.matrix().fixed_view::<3, 3>(0, 0).trace(),
