@@ -29,6 +29,12 @@ pub enum AppendError {
         /// The latest one.
         latest: u32,
     },
+    /// This robot began so many epochs that nobody would take another. Two processes with its key do that to one another.
+    #[error(
+        "{0} has more epochs than gossip.epochs_per_robot_max, and the others would refuse one more; see that only one \
+         process runs under its key, and give the robot a new key"
+    )]
+    EpochLimit(RobotId),
     /// The log is full or quarantined, or others hold entries of it that this robot did not write in this run or load
     /// from its store. Writing on would tell a second story.
     #[error("log {0} cannot be continued ({1}); begin a new epoch")]
@@ -103,6 +109,7 @@ impl Replica {
                 let (next, floor) = (log.next_seq(), log.floor());
                 (next, if raises { next } else { floor }, log.head().map(|head| head.hash).unwrap_or_default())
             }
+            None if self.check_epoch(frame).is_err() => return Err(AppendError::EpochLimit(robot)),
             None => (0, 0, Hash::default()),
         };
         let id = EntryId { frame, seq };

@@ -139,6 +139,9 @@ fn lengths_and_epochs_are_bounded_on_both_sides() {
         replica.append(&key(0), 0, &fact(k)).unwrap();
     }
     assert!(matches!(replica.append(&key(0), 0, &fact(3)), Err(AppendError::NewEpochNeeded(..))));
+    replica.append(&key(0), 1, &fact(0)).unwrap();
+    assert_eq!(replica.append(&key(0), 2, &fact(0)), Err(AppendError::EpochLimit(robot(0))), "nobody would take it");
+    assert!(replica.append(&key(0), 1, &fact(1)).is_ok());
 }
 
 #[test]
