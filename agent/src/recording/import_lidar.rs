@@ -8,7 +8,7 @@ use super::error::{Problem, RecordingError, on};
 use super::import::{Cut, Scan};
 use super::import_rgbd::rigid;
 use super::table::{number, pose_of};
-use merganser_protocol::config::Config;
+use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::recording::CloudFormat;
 use merganser_protocol::time::Stamp;
@@ -63,6 +63,7 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
     }
     let robots = if scans.len() < 3 * SCANS_PER_ROBOT_MIN { 2 } else { 3 };
     let mut config = Config::default();
+    config.submap.sensor = Sensor::Lidar3d;
     config.submap.voxel_m = 0.5;
     config.submap.distance_m = 10.0;
     config.submap.keyframes_max = (scans.len() / (robots * SUBMAPS_PER_ROBOT)).clamp(1, 10) as u32;

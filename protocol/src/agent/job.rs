@@ -11,7 +11,7 @@ use crate::ids::{FrameId, SubmapId};
 use crate::submap::landmarks::{self, LandmarkConfig};
 use crate::submap::planar::FlatConfig;
 use crate::submap::{
-    self, Described, Features, Keypoints, RefineError, RegisterConfig, RegisterError, Registered, Submap,
+    self, Described, Features, Keypoints, RefineConfig, RefineError, RegisterConfig, RegisterError, Registered, Submap,
 };
 use crate::wire::fact::{RefusalReason, ScaleKind};
 use std::collections::BTreeMap;
@@ -216,8 +216,8 @@ impl AlignJob {
             (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput),
             (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(theirs, mine, true),
             (Sensor::Landmarks, _) => self.landmarks(theirs, mine, false),
-            (Sensor::Points3d, ScaleKind::Metric) => self.register(theirs, mine),
-            (Sensor::Points3d, ScaleKind::Unknown) => self.align(theirs, mine),
+            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Metric) => self.register(theirs, mine),
+            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Unknown) => self.align(theirs, mine),
         }
     }
 
@@ -229,8 +229,12 @@ impl AlignJob {
     }
 
     fn register(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, RefusalReason> {
-        let config =
-            RegisterConfig { solver: self.solver(), fit_min: self.config.fit_min, ..RegisterConfig::default() };
+        let config = RegisterConfig {
+            solver: self.solver(),
+            fit_min: self.config.fit_min,
+            refine: RefineConfig::of(self.sensor),
+            ..RegisterConfig::default()
+        };
         self.measured(submap::register(theirs, mine, &config))
     }
 

@@ -248,18 +248,22 @@ impl Knowledge {
             let index = chains.get(&id.frame)?.binary_search(&id.index).ok()?;
             Some(SubmapId { index: index as u32, ..id })
         };
+        let bends = |fact: &AlignmentFact| !(self.is_of_ranges(fact.i) && self.is_of_ranges(fact.j));
         let tie = |entry: EntryId, i: SubmapId, j: SubmapId, t_i_j: Relative| {
             Some(AgreedAlignment { entry, i: place(i)?, j: place(j)?, t_i_j })
         };
-        let mut alignments: Vec<AgreedAlignment> = self
+        let (mut alignments, common): (Vec<AgreedAlignment>, Vec<f64>) = self
             .by_pair
             .iter()
             .filter(|((i, j), _)| place(*i).is_some() && place(*j).is_some())
             .filter_map(|(_, ids)| ids.iter().find(|id| self.agreement(**id) == Agreement::Agreed))
             .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
-            .filter_map(|(entry, fact)| tie(entry, fact.i, fact.j, self.measurement(entry, fact)))
-            .collect();
-        let shares = distortion::charge(&mut alignments);
+            .filter_map(|(entry, fact)| {
+                let tie = tie(entry, fact.i, fact.j, self.measurement(entry, fact))?;
+                Some((tie, distortion::common(bends(fact))))
+            })
+            .unzip();
+        let shares = distortion::charge(&mut alignments, &common);
         let sightings = self.sightings.iter();
         let sightings: Vec<AgreedAlignment> =
             sightings.filter_map(|(entry, fact)| tie(*entry, fact.i, fact.j, Relative::Metric(fact.t_i_j))).collect();
@@ -281,6 +285,11 @@ impl Knowledge {
             alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
             gaps: gaps.collect(),
         }
+    }
+
+    /// Whether a LiDAR saw the submap, by its owner's word.
+    fn is_of_ranges(&self, id: SubmapId) -> bool {
+        self.submap(id).and_then(|known| known.summary.as_ref()).is_some_and(Summary::is_of_ranges)
     }
 
     /// Submaps that an alignment or a sighting names.

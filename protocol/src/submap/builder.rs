@@ -200,7 +200,7 @@ impl SubmapBuilder {
         self.t_frame_body = match (&step, self.config.sensor) {
             (Some(step), Sensor::Laser2d) => self.t_frame_body * step.pose,
             (None, Sensor::Laser2d) | (_, Sensor::Landmarks2d) => flat(&keyframe.pose.pose),
-            (_, Sensor::Points3d | Sensor::Landmarks) => keyframe.pose.pose,
+            (_, Sensor::Points3d | Sensor::Lidar3d | Sensor::Landmarks) => keyframe.pose.pose,
         };
         self.track(&keyframe, step);
         self.extend(&keyframe);
@@ -269,7 +269,7 @@ impl SubmapBuilder {
     fn step(&mut self, keyframe: &Keyframe) -> Option<PoseWithCovariance> {
         let step = self.last.as_ref().map(|last| motion(last, keyframe, self.gap, &self.config));
         match self.config.sensor {
-            Sensor::Points3d | Sensor::Landmarks => step,
+            Sensor::Points3d | Sensor::Lidar3d | Sensor::Landmarks => step,
             Sensor::Landmarks2d => step.as_ref().map(flat_motion),
             Sensor::Laser2d => self.sharpener.sharpen(step, &keyframe.points, self.config.voxel_m),
         }
@@ -279,7 +279,7 @@ impl SubmapBuilder {
     /// sharpen the motion, the submaps' frame is not the SLAM's.
     fn way_apart(&self) -> f64 {
         match self.config.sensor {
-            Sensor::Points3d | Sensor::Landmarks | Sensor::Landmarks2d => 0.0,
+            Sensor::Points3d | Sensor::Lidar3d | Sensor::Landmarks | Sensor::Landmarks2d => 0.0,
             Sensor::Laser2d => f64::from(self.next_index) * self.config.distance_m,
         }
     }
@@ -325,7 +325,7 @@ impl SubmapBuilder {
                 let (points, marks) = flattened(&keyframe.points, &keyframe.marks);
                 open.landmarks.add(position, &t_first_body, &points, &marks);
             }
-            Sensor::Points3d | Sensor::Laser2d => {}
+            Sensor::Points3d | Sensor::Lidar3d | Sensor::Laser2d => {}
         }
         if self.config.sensor.sees_landmarks() {
             return;

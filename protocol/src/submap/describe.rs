@@ -36,7 +36,7 @@ pub struct Described {
 /// Normals, keypoints with descriptors, and summary of a submap.
 pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     match config.sensor {
-        Sensor::Points3d => in_space(submap, config),
+        Sensor::Points3d | Sensor::Lidar3d => in_space(submap, config),
         Sensor::Laser2d => planar::describe(submap, config),
         Sensor::Landmarks | Sensor::Landmarks2d => landmarks::describe(submap, config),
     }
@@ -73,7 +73,7 @@ fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {
     let shaped: Vec<u32> =
         (0..).zip(&normals).filter(|(_, n)| n.neighbours > KEYPOINT_NEIGHBOURS_MIN).map(|(k, _)| k).collect();
     let (keypoints, codes) = keypoints(&features.block, &shaped, config.keypoints.min(KEYPOINTS_MAX));
-    let summary = Summary::of(config.voxel_m, &codes);
+    let summary = Summary::of(config.voxel_m, &codes).seen_by(config.sensor);
     Described { features, keypoints, summary, extent }
 }
 

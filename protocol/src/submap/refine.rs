@@ -7,7 +7,8 @@
 //! (sandwich and jackknife estimators over patches of 4 to 40 voxels were no better, NEES 170 to 14,000). Measured,
 //! the error is nevertheless shaped like H⁻¹: large where the geometry is weak. So the textbook form stays, but
 //! however many keypoints there are they count as at most [`INDEPENDENT_MAX`] measurements, and as fewer with the square
-//! of the overlap.
+//! of the overlap. A LiDAR does not bend what it sees: what its points have in common is the surface's shape between
+//! them and the odometry of the submap, and they count as [`INDEPENDENT_LIDAR_MAX`].
 //!
 //! **Degeneracy.** Noise of the normals feigns information along a corridor. Information in a direction counts only
 //! from pairs whose normal leans clearly that way; where too little is left, the alignment is refused.
@@ -18,16 +19,20 @@ use super::block::Surfel;
 use super::cloud::Index;
 use super::features::{Features, Keypoints};
 use super::visibility::contradiction;
+use crate::config::Sensor;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, So3};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use thiserror::Error;
 
-/// Independent measurements that the keypoints of fully overlapping submaps amount to, however many they are. Fitted to
-/// 7-Scenes (see the [module](self)); on LiDAR and in simulation the result is conservative.
+/// Independent measurements that the keypoints of fully overlapping submaps amount to, however many they are, where a
+/// depth camera bends its views. Fitted to 7-Scenes (see the [module](self)).
 pub const INDEPENDENT_MAX: f64 = 15.5;
-/// The same where matched points hold the pose too: such poses were chosen among many, at lower overlaps and in frames that
-/// are turned at random (measured: NEES 5.4 at 13).
-const INDEPENDENT_ANCHORED_MAX: f64 = 12.0;
+/// The same for LiDAR. Measured: NEES 1.9 to 2.3 for 6 degrees of freedom on KITTI 07, in ray-cast halls 1.4, and 3.4 to
+/// 4.9 where the odometry drifts inside a submap; two and a half times as many are too many there (5.6 to 7.9).
+pub const INDEPENDENT_LIDAR_MAX: f64 = 100.0;
+/// Of these, where matched points hold the pose too: such poses were chosen among many, at lower overlaps and in frames that
+/// are turned at random. Measured: NEES 4.9 on 7-Scenes.
+const ANCHORED_SHARE: f64 = 0.775;
 /// Factor on the textbook covariance for what does shrink with the number of keypoints.
 const SAMPLING_INFLATION: f64 = 2.0;
 /// Floor of the standard deviation in every direction at the pairs' centroid and rim, in voxels: quantisation and the
@@ -66,11 +71,29 @@ pub struct RefineConfig {
     /// Largest accepted [`contradiction`]. Measured over 154 right alignments at most 0.01, over 8 wrong ones that the
     /// solver accepted 0.08 to 0.18; moving things raise it.
     pub contradiction_max: f64,
+    /// Independent measurements that all keypoints together amount to at most.
+    pub independent_max: f64,
 }
 
 impl Default for RefineConfig {
     fn default() -> Self {
-        Self { iterations_max: 30, pairs_min: 20, share_min: 0.002, contradiction_max: 0.04 }
+        Self {
+            iterations_max: 30,
+            pairs_min: 20,
+            share_min: 0.002,
+            contradiction_max: 0.04,
+            independent_max: INDEPENDENT_MAX,
+        }
+    }
+}
+
+impl RefineConfig {
+    /// What suits the sensor.
+    pub fn of(sensor: Sensor) -> Self {
+        match sensor {
+            Sensor::Lidar3d => Self { independent_max: INDEPENDENT_LIDAR_MAX, ..Self::default() },
+            _ => Self::default(),
+        }
     }
 }
 
@@ -301,8 +324,8 @@ impl System {
             return Err(degenerate);
         }
         let (pairs, offered) = (self.pairs as f64, offered as f64);
-        let independent = if anchors.is_empty() { INDEPENDENT_MAX } else { INDEPENDENT_ANCHORED_MAX };
-        let inflation = SAMPLING_INFLATION + offered * offered / (pairs * independent);
+        let share = if anchors.is_empty() { 1.0 } else { ANCHORED_SHARE };
+        let inflation = SAMPLING_INFLATION + offered * offered / (pairs * share * config.independent_max);
         let floor = FLOOR_VOXELS * voxel;
         let variances = shares.map(|share| inflation * self.sigma * self.sigma / (share * weight) + floor * floor);
         let root = self.to_anchor() * eigen.eigenvectors;

@@ -8,6 +8,7 @@
 //! words (signs of seven numbers, 0.84 and 0.34), of means, and of second moments.
 
 use super::descriptor::{Code, Projection};
+use crate::config::Sensor;
 use thiserror::Error;
 
 /// Bytes of an encoded summary at most.
@@ -15,8 +16,10 @@ pub const SUMMARY_LEN_MAX: usize = 400;
 
 /// Version of the layout: of points on surfaces...
 const VERSION: u8 = 2;
-/// ...and of landmarks.
+/// ...of landmarks...
 const LANDMARKS: u8 = 3;
+/// ...and of points on surfaces as a LiDAR sees them.
+const RANGES: u8 = 4;
 /// Numbers of a descriptor that are used.
 const NUMBERS: usize = 16;
 /// Levels of each.
@@ -38,7 +41,7 @@ const ROUNDING: f64 = 1.0 - 1e-9;
 /// What is gossiped of a submap's looks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Summary {
-    /// What the words mean: [`VERSION`] or [`LANDMARKS`].
+    /// What the words mean: [`VERSION`], [`LANDMARKS`] or [`RANGES`].
     version: u8,
     /// Edge of the voxel the cloud was thinned to, frame units.
     voxel: f32,
@@ -99,6 +102,18 @@ impl Summary {
         Self { version: LANDMARKS, ..Self::of_shares(voxel, shares) }
     }
 
+    /// The same, of what this sensor saw.
+    #[must_use]
+    pub(super) fn seen_by(self, sensor: Sensor) -> Self {
+        let version = if sensor == Sensor::Lidar3d { RANGES } else { self.version };
+        Self { version, ..self }
+    }
+
+    /// Whether a LiDAR saw the submap, which does not bend its views.
+    pub fn is_of_ranges(&self) -> bool {
+        self.version == RANGES
+    }
+
     fn new(version: u8, voxel: f32, words: [u8; WORDS]) -> Self {
         Self { version, voxel, words, square: dot(&words, &words) }
     }
@@ -120,7 +135,9 @@ impl Summary {
         // The labels of landmarks do not depend on a voxel, whose unit may be anything.
         let comparable = match (self.version, other.version) {
             (LANDMARKS, LANDMARKS) => true,
-            (a, b) => a == b && (1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio),
+            (a, b) => {
+                (a == LANDMARKS) == (b == LANDMARKS) && (1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio)
+            }
         };
         if surely_below || squares == 0.0 || !comparable {
             return (least <= 0.0).then_some(0.0);
@@ -144,7 +161,7 @@ impl Summary {
     /// [`SummaryError`], naming the first check that failed.
     pub fn decode(bytes: &[u8]) -> Result<Self, SummaryError> {
         if let [version, numbers, ..] = *bytes
-            && (!matches!(version, VERSION | LANDMARKS) || usize::from(numbers) != NUMBERS)
+            && (!matches!(version, VERSION | LANDMARKS | RANGES) || usize::from(numbers) != NUMBERS)
         {
             return Err(SummaryError::UnknownLayout { version, numbers });
         }

@@ -1,7 +1,7 @@
 //! Real submaps with true poses, from the data folder (`MERGANSER_SHARED` or `../shared` beside the workspace): the sets
 //! of the prototype, ten RGB-D submaps of one room and five LiDAR scans along a street.
 
-use merganser_protocol::config::SubmapConfig;
+use merganser_protocol::config::{Sensor, SubmapConfig};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::submap::{CovarianceOf, Described, Keyframe, SubmapBuilder, describe};
 use merganser_protocol::time::Stamp;
@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// A described submap and its true place.
 pub struct Place {
+    pub sensor: Sensor,
     pub described: Described,
     pub t_world_anchor: Se3,
     /// Processor time that describing it took, if the system tells.
@@ -36,8 +37,9 @@ pub fn shared() -> Option<PathBuf> {
     Some(folder)
 }
 
-pub fn config(voxel_m: f64, keyframes_max: u32) -> SubmapConfig {
-    SubmapConfig { voxel_m, keyframes_max, distance_m: 1e3, rotation_deg: 1e6, keypoints: 512, ..Default::default() }
+pub fn config(sensor: Sensor, voxel_m: f64, keyframes_max: u32) -> SubmapConfig {
+    let uncut = SubmapConfig { distance_m: 1e3, rotation_deg: 1e6, ..Default::default() };
+    SubmapConfig { sensor, voxel_m, keyframes_max, keypoints: 512, ..uncut }
 }
 
 /// A submap of keyframes at poses that are true.
@@ -60,7 +62,7 @@ pub fn place_drifted(config: &SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>
     let start = thread_cpu_ms();
     let described = describe(&submap, config);
     let describe_ms = start.and_then(|start| Some(thread_cpu_ms()? - start));
-    Place { described, t_world_anchor, describe_ms }
+    Place { sensor: config.sensor, described, t_world_anchor, describe_ms }
 }
 
 /// Processor time of this thread so far.
@@ -78,7 +80,7 @@ pub fn seven_scenes(data: &Path) -> Set {
         .map(numbers)
         .map(|v| Se3::from_matrix(&Matrix4::from_row_slice(&v[1..17])))
         .collect();
-    let config = config(0.05, 5);
+    let config = config(Sensor::Points3d, 0.05, 5);
     let places = (0..1000).step_by(100).map(|first| {
         let frames = (first..first + 100).step_by(20);
         place(&config, frames.map(|k| (poses[k], depth_points(&folder, k))).collect())
@@ -89,7 +91,7 @@ pub fn seven_scenes(data: &Path) -> Set {
 /// KITTI 07: 5 scans, each a submap.
 pub fn kitti07(data: &Path) -> Set {
     let folder = data.join("lidar_gtsam_points/kitti_07_dump");
-    let config = config(0.5, 1);
+    let config = config(Sensor::Lidar3d, 0.5, 1);
     let graph = fs::read_to_string(folder.join("graph.txt")).unwrap();
     let places = graph.lines().enumerate().map(|(k, line)| {
         let v = numbers(line.trim_start_matches('v'));
@@ -102,7 +104,7 @@ pub fn kitti07(data: &Path) -> Set {
 
 /// KITTI 00: 5 scans of another street, 2 pairs of which overlap.
 pub fn kitti00(data: &Path) -> Vec<Place> {
-    let config = config(0.5, 1);
+    let config = config(Sensor::Lidar3d, 0.5, 1);
     let scans = ["000000", "000005", "000094", "000198", "000199"];
     let load = |name: &str| {
         let bytes = fs::read(data.join(format!("kitti00_scans/{name}.bin"))).unwrap();

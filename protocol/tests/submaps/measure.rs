@@ -60,7 +60,7 @@ pub fn trial(theirs: &Place, mine: &Place, keypoints: usize, truth: Option<&Se3>
     trial.fit = fit(&keypoints, features, &sim, near);
     if trial.fit >= FIT_MIN {
         trial.rough = Some(sim.to_se3());
-        trial.refined = refine(&keypoints, features, &sim.to_se3(), &RefineConfig::default()).ok();
+        trial.refined = refine(&keypoints, features, &sim.to_se3(), &RefineConfig::of(mine.sensor)).ok();
     }
     trial
 }

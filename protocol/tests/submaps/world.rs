@@ -2,6 +2,7 @@
 //! that drifts inside each submap.
 
 use crate::data::{Place, Set, config, place_drifted};
+use merganser_protocol::config::Sensor;
 use merganser_protocol::geometry::{Se3, So3};
 use nalgebra::{Vector3, Vector6};
 use rand::{RngExt, SeedableRng};
@@ -113,7 +114,7 @@ impl World {
             t_world_body = t_world_body.retract(&step);
             believed = believed.retract(&(step + error));
         }
-        place_drifted(&config(voxel, 5), keyframes, &truth)
+        place_drifted(&config(Sensor::Lidar3d, voxel, 5), keyframes, &truth)
     }
 
     /// Several submaps of this world.

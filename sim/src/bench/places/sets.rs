@@ -107,7 +107,7 @@ impl Maker {
         }
         Ok(Set {
             name: "kitti07",
-            sensor: Sensor::Points3d,
+            sensor: Sensor::Lidar3d,
             places,
             rotation_deg: 5.0,
             translation_m: 2.0,
@@ -126,7 +126,7 @@ impl Maker {
         }
         Ok(Set {
             name: "kitti00",
-            sensor: Sensor::Points3d,
+            sensor: Sensor::Lidar3d,
             places,
             rotation_deg: 5.0,
             translation_m: 2.0,
