@@ -120,6 +120,9 @@ pub struct AlignConfig {
     pub candidates_max: usize,
     /// Similarity of summaries (0 to 1) from which a pair is a candidate.
     pub similarity_min: f64,
+    /// Bytes of keypoints and facts per second, in the mean, for aligning further what has merged already: a longer drive
+    /// and a surer map. Until two frames have merged they are aligned as fast as the link lets.
+    pub further_bytes_per_sec: f64,
 }
 
 impl Default for AlignConfig {
@@ -132,6 +135,7 @@ impl Default for AlignConfig {
             jobs_max: 2,
             candidates_max: 4096,
             similarity_min: 0.0,
+            further_bytes_per_sec: 2_000.0,
         }
     }
 }
@@ -248,6 +252,7 @@ impl Config {
         range("align.jobs_max", a.jobs_max as f64, 1.0, 64.0, "use 1 to 64")?;
         range("align.candidates_max", a.candidates_max as f64, 1.0, 1e6, "use 1 to 1000000")?;
         range("align.similarity_min", a.similarity_min, 0.0, 1.0, "use 0 to 1")?;
+        range("align.further_bytes_per_sec", a.further_bytes_per_sec, 10.0, 1e9, "use 10 to 1e9 bytes per second")?;
         range("estimate.alignments_min", e.alignments_min as f64, 1.0, 1e3, "use 1 to 1000; 3 is safe")?;
         range("estimate.log10_nfa_max", e.log10_nfa_max, -300.0, 0.0, "use a value from -300 to 0")?;
         range("estimate.covariance_scale_max", e.covariance_scale_max, 1.0, 10.0, "use 1 to 10")?;

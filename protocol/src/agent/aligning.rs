@@ -2,14 +2,13 @@
 //! and verified.
 
 use super::Agent;
+use super::allowance::FACT_BYTES;
 use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Look, Measured};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
-use super::negotiation::{
-    FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, TRIES_PER_SUBMAP_TIED, VERIFICATIONS_MAX, Work,
-};
+use super::negotiation::{FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work};
+use super::ranking::Proposal;
 use super::shortlist::Candidate;
-use super::stated::Stated;
 use crate::config::AlignConfig;
 use crate::geometry::Relative;
 use crate::ids::{EntryId, Hash, RobotId, SubmapId};
@@ -22,10 +21,6 @@ use std::sync::Arc;
 
 /// When a fetch is looked at again that nobody can serve now.
 const FETCH_AGAIN: Duration = Duration::from_millis(500);
-
-/// Two frames that are tied well enough as such are aligned further where a submap has drifted from the other by this many
-/// standard deviations of an alignment.
-const NEWS_MIN: f64 = 1.0;
 
 impl Agent {
     /// A fact has taken effect: what does it call for?
@@ -99,7 +94,8 @@ impl Agent {
 
     /// Starts as many alignments as allowed: answers owed first, then the most promising candidates.
     pub(super) fn start_aligning(&mut self) {
-        if self.negotiation.take_stirred() && !self.receive_only {
+        let further = self.allowance.take_due(self.now);
+        if (self.negotiation.take_stirred() || further) && !self.receive_only {
             self.start_verifying();
             if self.has_room() || !self.negotiation.fetches.is_empty() {
                 let active = self.active_candidates();
@@ -136,75 +132,30 @@ impl Agent {
         blob(fact.i) == Some(fact.blobs[0]) && blob(fact.j) == Some(fact.blobs[1])
     }
 
-    fn start_proposing(&mut self, active: &[Candidate]) {
-        for &Candidate { mine, theirs, .. } in active {
+    fn start_proposing(&mut self, active: &[Proposal]) {
+        self.negotiation.begun.retain(|begun| active.iter().any(|p| pair_of(p.mine, p.theirs) == *begun));
+        for &Proposal { mine, theirs, may_wait } in active {
             if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
                 break;
+            }
+            let pair = pair_of(mine, theirs);
+            if may_wait && !self.negotiation.begun.contains(&pair) {
+                if !self.allowance.may_spend(self.now) {
+                    continue;
+                }
+                self.negotiation.begun.insert(pair);
             }
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
             let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);
             let lacks = ours.any(|id| self.negotiation.features(id).is_none());
             if lacks || self.start_alignment(mine, theirs, Purpose::Propose) {
-                self.negotiation.mark_tried(pair_of(mine, theirs));
+                self.negotiation.mark_tried(pair);
             }
         }
-    }
-
-    /// Candidates worth their cost now, best first.
-    pub(super) fn active_candidates(&self) -> Vec<Candidate> {
-        let stated = self.stated();
-        self.negotiation.ranked(|candidate| self.gain(candidate, &stated))
-    }
-
-    fn stated(&self) -> Stated {
-        let mut stated = Stated::default();
-        for (id, fact) in self.knowledge.alignments() {
-            if self.knowledge.agreement(id) != Agreement::Disputed {
-                stated.count((fact.i, fact.j), &fact.t_i_j);
-            }
-        }
-        stated
-    }
-
-    /// Expected gain of a pair: unmerged frames first, then where the two submaps are alike and least is known of how they
-    /// lie; nothing where the joint estimate says that they cannot touch, or where another alignment of theirs would say
-    /// too little.
-    fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
-        let (a, b) = pair_of(candidate.mine, candidate.theirs);
-        let is_loop = self.is_loop(candidate.mine, candidate.theirs);
-        if self.is_out_of_reach(candidate.theirs) || (is_loop && self.is_out_of_reach(candidate.mine)) {
-            return None;
-        }
-        if stated.has_said_enough((a, b), self.config.estimate.alignments_min) {
-            return None;
-        }
-        let worth = candidate.similarity + if candidate.wished { 0.5 } else { 0.0 };
-        let tied = stated.tied((a, b));
-        let Some((distance, drift)) = self.distance(a, b).zip(self.drift_between(a, b)) else {
-            return tied.is_none().then_some(1.5 + worth);
-        };
-        if distance > self.reach(a) + self.reach(b) {
-            return None;
-        }
-        let Some(sigma) = tied else { return Some(worth) };
-        let news = drift / sigma;
-        if self.negotiation.tries(candidate) >= TRIES_PER_SUBMAP_TIED || news < NEWS_MIN {
-            return None;
-        }
-        // Loops of our own come first: they cost no radio.
-        let share = if is_loop { 1.0 } else { news / (1.0 + news) };
-        Some(0.5 * worth * share)
-    }
-
-    /// The least that the standard deviation of the two anchors' distance vector can be, over all axes, where all frames
-    /// have our unit: the difference of those of their positions (triangle inequality in L²), whatever they share.
-    fn drift_between(&self, a: SubmapId, b: SubmapId) -> Option<f64> {
-        let sigma = |id| self.map.solved.anchors.get(&id).map(|t: &Relative| t.translation_variance().sqrt());
-        Some((sigma(a)? - sigma(b)?).abs())
     }
 
     /// Nobody in reach has the submap's keypoints.
-    fn is_out_of_reach(&self, id: SubmapId) -> bool {
+    pub(super) fn is_out_of_reach(&self, id: SubmapId) -> bool {
         !self.negotiation.out_of_reach.is_empty()
             && self.knowledge.submap(id).is_some_and(|fact| self.negotiation.out_of_reach.contains(&fact.blob))
     }
@@ -216,18 +167,6 @@ impl Agent {
             fact.is_none_or(|fact| !self.is_out_of_reach(fact.i) && !self.is_out_of_reach(fact.j))
         };
         self.negotiation.verify.iter().filter(reachable).copied().collect()
-    }
-
-    /// Distance between two anchors by the joint estimate, if they are connected.
-    fn distance(&self, a: SubmapId, b: SubmapId) -> Option<f64> {
-        let position = |id| self.map.solved.anchors.get(&id).map(|t: &Relative| t.sim().translation);
-        Some((position(a)? - position(b)?).norm())
-    }
-
-    /// How far from its anchor a submap may still overlap another: half its extent.
-    fn reach(&self, id: SubmapId) -> f64 {
-        let [x, y, z] = self.knowledge.submap(id).map_or([0.0; 3], |fact| fact.extent).map(f64::from);
-        0.5 * (x * x + y * y + z * z).sqrt()
     }
 
     /// Starts aligning a pair, if the keypoints it takes are here; otherwise has them fetched.
@@ -256,7 +195,7 @@ impl Agent {
     }
 
     /// Both submaps are ours: nobody else will look at the pair.
-    fn is_loop(&self, mine: SubmapId, theirs: SubmapId) -> bool {
+    pub(super) fn is_loop(&self, mine: SubmapId, theirs: SubmapId) -> bool {
         mine.frame.robot == theirs.frame.robot
     }
 
@@ -294,8 +233,8 @@ impl Agent {
     }
 
     /// Stops fetching what no pair needs any more: of those that were active, the ones that have not begun.
-    fn drop_idle_fetches(&mut self, active: &[Candidate]) {
-        let waits = |c: &&Candidate| !self.negotiation.is_tried(pair_of(c.mine, c.theirs));
+    fn drop_idle_fetches(&mut self, active: &[Proposal]) {
+        let waits = |c: &&Proposal| !self.negotiation.is_tried(pair_of(c.mine, c.theirs));
         let mut wanted: BTreeSet<SubmapId> = active.iter().filter(waits).flat_map(|c| [c.mine, c.theirs]).collect();
         for id in self.answers_owed() {
             wanted.extend(self.knowledge.alignment(id).into_iter().flat_map(|fact| [fact.i, fact.j]));
@@ -371,6 +310,7 @@ impl Agent {
         let blob = |id| self.knowledge.submap(id).map(|fact| fact.blob);
         let (Some(blob_i), Some(blob_j)) = (blob(i), blob(j)) else { return };
         self.event(Event::AlignmentProposed { i, j, support: measured.support });
+        self.allowance.spend(self.now, FACT_BYTES);
         let fact = Fact::Alignment(AlignmentFact {
             i,
             j,
@@ -384,6 +324,7 @@ impl Agent {
     }
 
     fn write_verdict(&mut self, alignment: EntryId, outcome: VerdictOutcome) {
+        self.allowance.spend(self.now, FACT_BYTES);
         self.write(self.me.frame.epoch, &Fact::Verdict(VerdictFact { alignment, outcome }));
     }
 
@@ -394,7 +335,7 @@ impl Agent {
             .negotiation
             .wishes
             .iter()
-            .filter(|(pair, _)| reachable(pair) && self.distance(pair.0, pair.1).is_none())
+            .filter(|(pair, _)| reachable(pair) && !self.are_connected(pair.0, pair.1))
             .max_by(|a, b| a.1.similarity.total_cmp(&b.1.similarity).then(b.0.cmp(&a.0)))
             .map(|(pair, _)| pair)?;
         self.negotiation.wishes.remove(best);

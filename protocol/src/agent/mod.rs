@@ -7,6 +7,7 @@
 //! published, counted in the have-vector, used in the estimate) when [`Input::Persisted`] confirms it.
 
 mod aligning;
+mod allowance;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
@@ -19,6 +20,7 @@ mod job_tests;
 mod knowledge;
 mod mapping;
 mod negotiation;
+mod ranking;
 mod shortlist;
 mod solving;
 mod stated;
@@ -34,6 +36,7 @@ use crate::replica::{AppendError, IngestError, Ingested, Replica, RosterError};
 use crate::time::Instant;
 use crate::wire::EntryBytes;
 use crate::wire::fact::Fact;
+use allowance::Allowance;
 use condensing::Condensing;
 use ed25519_dalek::SigningKey;
 use gossip::Gossip;
@@ -113,6 +116,7 @@ pub struct Agent {
     knowledge: Knowledge,
     mapper: Mapper,
     negotiation: Negotiation,
+    allowance: Allowance,
     gossip: Gossip,
     map: MapState,
     stats: Stats,
@@ -170,6 +174,7 @@ impl Agent {
         let frame = FrameId { robot, epoch: restored.fresh_epoch };
         let mut agent = Self {
             mapper: Mapper::new(&config.submap),
+            allowance: Allowance::new(config.align.further_bytes_per_sec, now.min(LATEST)),
             gossip: Gossip::new(robot, &config.gossip, now.min(LATEST)),
             me: Me { robot, frame, key, name: identity.name, swarm: identity.swarm },
             rng: ChaCha8Rng::seed_from_u64(seed),
@@ -224,7 +229,8 @@ impl Agent {
 
     /// When [`Input::Timeout`] is wanted. Only [`Agent::handle`] changes it.
     pub fn poll_timeout(&self) -> Option<Instant> {
-        [self.gossip_timeout(), self.fetch_timeout(), self.solve_timeout()].into_iter().flatten().min()
+        let further = self.allowance.timeout(self.now);
+        [self.gossip_timeout(), self.fetch_timeout(), self.solve_timeout(), further].into_iter().flatten().min()
     }
 
     /// This robot.

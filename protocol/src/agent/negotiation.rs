@@ -104,6 +104,8 @@ pub struct Negotiation {
     pub out_of_reach: BTreeSet<Hash>,
     /// Jobs under way.
     pub running: BTreeMap<JobId, Work>,
+    /// Pairs that were let through to spend keypoints on, and not tried yet.
+    pub begun: BTreeSet<Pair>,
     /// Something changed that may make work startable.
     stirred: bool,
     /// Pairs we are not responsible for and would like to see tried.
@@ -202,6 +204,7 @@ impl Negotiation {
 
     /// Takes a pair off the list for good.
     pub fn mark_tried(&mut self, pair: Pair) {
+        self.begun.remove(&pair);
         if let Some(candidate) = self.candidates.remove(pair) {
             *self.tries.entry((candidate.mine, candidate.theirs.frame)).or_default() += 1;
         }
@@ -231,6 +234,7 @@ impl Negotiation {
     pub fn clear_candidates(&mut self) {
         self.candidates.clear();
         self.wishes.clear();
+        self.begun.clear();
         self.verify.clear();
     }
 

@@ -35,15 +35,29 @@ impl Stated {
     /// One of the submaps has said enough of the other's frame, which is never less than the `alignments_min` that it takes
     /// to merge.
     pub(super) fn has_said_enough(&self, (i, j): Pair, alignments_min: usize) -> bool {
-        let of_submap = |id, other| self.of_submap.get(&(id, other)).copied().unwrap_or(0);
-        let most = of_submap(i, j.frame).max(of_submap(j, i.frame));
+        let most = self.of_submap(i, j.frame).max(self.of_submap(j, i.frame));
         most >= ALIGNMENTS_PER_SUBMAP.max(alignments_min)
     }
 
-    /// Where two frames are tied well enough as such: standard deviation of the translation of an alignment of theirs, over
-    /// all axes, in the mean.
-    pub(super) fn tied(&self, (i, j): Pair) -> Option<f64> {
-        let of_frames = self.of_frames.get(&(i.frame, j.frame)).filter(|of| of.count >= ALIGNMENTS_PER_FRAME_PAIR)?;
+    /// Alignments of a submap with a frame.
+    pub(super) fn of_submap(&self, id: SubmapId, other: FrameId) -> usize {
+        self.of_submap.get(&(id, other)).copied().unwrap_or(0)
+    }
+
+    /// Alignments between the frames of two submaps.
+    pub(super) fn between(&self, (i, j): Pair) -> usize {
+        self.of_frames.get(&(i.frame, j.frame)).map_or(0, |of| of.count)
+    }
+
+    /// Whether two frames are tied well enough as such.
+    pub(super) fn is_tied(&self, pair: Pair) -> bool {
+        self.between(pair) >= ALIGNMENTS_PER_FRAME_PAIR
+    }
+
+    /// Standard deviation of the translation of an alignment between the two frames, over all axes, in the mean and in the
+    /// unit of the second; `None` without any.
+    pub(super) fn sigma(&self, (i, j): Pair) -> Option<f64> {
+        let of_frames = self.of_frames.get(&(i.frame, j.frame))?;
         Some((of_frames.variance / of_frames.count as f64).sqrt())
     }
 }
@@ -82,12 +96,15 @@ mod tests {
     fn two_frames_are_tied_well_enough_at_their_limit_and_not_before() {
         let mut stated = Stated::default();
         for n in 0..ALIGNMENTS_PER_FRAME_PAIR as u32 {
-            assert_eq!(stated.tied((submap(1, 99), submap(2, 99))), None, "{n}");
+            let pair = (submap(1, 99), submap(2, 99));
+            assert!(!stated.is_tied(pair) && stated.between(pair) == n as usize, "{n}");
+            assert_eq!(stated.sigma(pair).is_some(), n > 0);
             stated.count((submap(1, n), submap(2, n)), &measured(if n % 2 == 0 { 0.1 } else { 0.2 }));
         }
-        let sigma = stated.tied((submap(1, 99), submap(2, 99))).unwrap();
+        assert!(stated.is_tied((submap(1, 99), submap(2, 99))));
+        let sigma = stated.sigma((submap(1, 99), submap(2, 99))).unwrap();
         // Three axes, half of the alignments with either.
         assert!((sigma - (3.0 * 0.5 * (0.01 + 0.04f64)).sqrt()).abs() < 1e-6, "{sigma}");
-        assert_eq!(stated.tied((submap(1, 99), submap(3, 99))), None);
+        assert!(!stated.is_tied((submap(1, 99), submap(3, 99))));
     }
 }

@@ -55,7 +55,7 @@ impl Agent {
 
     /// Work that this robot still has to do with the facts it holds.
     fn pending(&self) -> u64 {
-        let aligning = self.negotiation.running.len() + self.answers_owed().len() + self.active_candidates().len();
+        let aligning = self.negotiation.running.len() + self.answers_owed().len() + self.proposals();
         self.unsaved() + aligning as u64
     }
 

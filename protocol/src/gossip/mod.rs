@@ -27,6 +27,7 @@ use crate::replica::{Have, Replica};
 use crate::time::Instant;
 use crate::wire::{HaveRoot, HaveVector};
 pub use budget::{Budget, Class, PIECE_BYTES_MIN, REPAIR_BYTES_MIN, burst_bytes};
+pub(crate) use purse::Bucket;
 
 use announce::Announce;
 use core::time::Duration;

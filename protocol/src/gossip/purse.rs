@@ -11,7 +11,7 @@ const WAIT_MIN: Duration = Duration::from_millis(50);
 
 /// A token bucket: it fills steadily up to a limit, and may be in debt.
 #[derive(Clone, Debug)]
-pub(super) struct Bucket {
+pub(crate) struct Bucket {
     level: f64,
     at: Instant,
     per_sec: f64,

@@ -1,0 +1,77 @@
+//! What may be spent on knowing better what is known already: frames that have merged are aligned further at a steady cost
+//! in bytes, whatever the gain, so that a robot that drives for hours does not fill its radio. Merging itself need not
+//! wait, but is paid for out of the same purse.
+
+use crate::gossip::Bucket;
+use crate::time::Instant;
+
+/// Seconds of income that are saved up at most, and owed at most.
+pub const SAVED_SECS_MAX: f64 = 60.0;
+/// About what a stated alignment, or the answer to one, takes as a fact on its way to the others, bytes.
+pub(super) const FACT_BYTES: usize = 320;
+
+/// See the module.
+pub(super) struct Allowance {
+    bucket: Bucket,
+    /// Something was put off.
+    is_awaited: bool,
+}
+
+impl Allowance {
+    pub fn new(bytes_per_sec: f64, now: Instant) -> Self {
+        Self { bucket: Bucket::new(bytes_per_sec, SAVED_SECS_MAX * bytes_per_sec, now), is_awaited: false }
+    }
+
+    /// Whether more may be spent. If not, [`Allowance::timeout`] tells when.
+    pub fn may_spend(&mut self, now: Instant) -> bool {
+        let may = self.has_some(now);
+        self.is_awaited |= !may;
+        may
+    }
+
+    /// The same, to ask only.
+    pub fn has_some(&self, now: Instant) -> bool {
+        self.bucket.due(now, 0.0) <= now
+    }
+
+    /// So many bytes were spent, allowed or not.
+    pub fn spend(&mut self, now: Instant, bytes: usize) {
+        let left = self.bucket.level(now) - bytes as f64;
+        self.bucket.set(now, left.max(-self.bucket.full()));
+    }
+
+    /// When what was put off may be done.
+    pub fn timeout(&self, now: Instant) -> Option<Instant> {
+        self.is_awaited.then(|| self.bucket.due(now, 0.0))
+    }
+
+    /// Whether what was put off may be done from now on; true once.
+    pub fn take_due(&mut self, now: Instant) -> bool {
+        let due = self.timeout(now).is_some_and(|due| due <= now);
+        self.is_awaited &= !due;
+        due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use core::time::Duration;
+
+    #[test]
+    fn what_is_spent_comes_back_at_the_stated_pace_and_debts_are_bounded() {
+        let start = Instant::ZERO;
+        let mut allowance = Allowance::new(100.0, start);
+        assert!(allowance.may_spend(start) && allowance.timeout(start).is_none());
+        allowance.spend(start, 6_000);
+        assert!(allowance.may_spend(start), "all of it");
+        allowance.spend(start, 500);
+        assert!(!allowance.may_spend(start) && !allowance.take_due(start));
+        let due = start.after(Duration::from_secs(5));
+        assert_eq!(allowance.timeout(start), Some(due));
+        assert!(allowance.take_due(due) && !allowance.take_due(due) && allowance.may_spend(due));
+        allowance.spend(due, usize::MAX);
+        assert!(!allowance.may_spend(due));
+        assert_eq!(allowance.timeout(due), Some(due.after(Duration::from_secs_f64(SAVED_SECS_MAX))));
+    }
+}

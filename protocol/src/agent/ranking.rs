@@ -1,0 +1,156 @@
+//! Which pairs of submaps to align next, and which of them may wait: first what joins frames that nothing connects yet, then
+//! where the joint estimate knows least for the bytes it costs to know more.
+
+use super::Agent;
+use super::knowledge::{Agreement, Pair, pair_of};
+use super::negotiation::TRIES_PER_SUBMAP_TIED;
+use super::shortlist::Candidate;
+use super::stated::Stated;
+use crate::geometry::Relative;
+use crate::ids::SubmapId;
+
+/// Two frames that are tied well enough as such are aligned further where a submap has drifted from the other by this many
+/// standard deviations of an alignment.
+const NEWS_MIN: f64 = 1.0;
+/// Alignments, in units of what it takes to merge, after which two frames that still have not merged may wait with more.
+const MERGE_ATTEMPTS: usize = 2;
+
+/// A pair worth trying.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Proposal {
+    pub mine: SubmapId,
+    pub theirs: SubmapId,
+    /// It moves keypoints, and only makes surer what is known: not before more may be spent.
+    pub may_wait: bool,
+}
+
+impl Agent {
+    /// Candidates worth their cost, best first.
+    pub(super) fn active_candidates(&self) -> Vec<Proposal> {
+        let stated = self.stated();
+        let proposal = |candidate: Candidate| {
+            let Candidate { mine, theirs, .. } = candidate;
+            let pair = pair_of(mine, theirs);
+            let merges = !self.are_connected(mine, theirs)
+                && stated.between(pair) < MERGE_ATTEMPTS * self.config.estimate.alignments_min;
+            Proposal { mine, theirs, may_wait: !merges && self.blobs_lacking(&candidate, &stated) > 0 }
+        };
+        self.negotiation.ranked(|candidate| self.gain(candidate, &stated)).into_iter().map(proposal).collect()
+    }
+
+    /// Active candidates without those that are put off until more may be spent: they are no work left to do.
+    pub(super) fn proposals(&self) -> usize {
+        let may_spend = self.allowance.has_some(self.now);
+        self.active_candidates().iter().filter(|proposal| may_spend || !proposal.may_wait).count()
+    }
+
+    /// Whether the joint estimate knows how the two submaps lie.
+    pub(super) fn are_connected(&self, a: SubmapId, b: SubmapId) -> bool {
+        self.anchor(a).is_some() && self.anchor(b).is_some()
+    }
+
+    fn stated(&self) -> Stated {
+        let mut stated = Stated::default();
+        for (id, fact) in self.knowledge.alignments() {
+            if self.knowledge.agreement(id) != Agreement::Disputed {
+                stated.count((fact.i, fact.j), &fact.t_i_j);
+            }
+        }
+        stated
+    }
+
+    /// Expected gain of a pair: unmerged frames first, then where the two submaps are alike and least is known of how they
+    /// lie, for as few keypoints as possible; nothing where the joint estimate says that they cannot touch, or where
+    /// another alignment of theirs would say too little.
+    fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
+        let pair = pair_of(candidate.mine, candidate.theirs);
+        let is_loop = self.is_loop(candidate.mine, candidate.theirs);
+        if self.is_out_of_reach(candidate.theirs) || (is_loop && self.is_out_of_reach(candidate.mine)) {
+            return None;
+        }
+        if stated.has_said_enough(pair, self.config.estimate.alignments_min) {
+            return None;
+        }
+        let is_tied = stated.is_tied(pair);
+        let worth = candidate.similarity + if candidate.wished { 0.5 } else { 0.0 };
+        let Some((at_a, at_b)) = self.anchor(pair.0).zip(self.anchor(pair.1)) else {
+            return (!is_tied).then_some(1.5 + worth);
+        };
+        if !self.may_touch(pair, at_a, at_b) {
+            return None;
+        }
+        let news = stated.sigma(pair).map(|sigma| drift_between(at_a, at_b) / (sigma * at_b.sim().scale));
+        let is_news = self.negotiation.tries(candidate) < TRIES_PER_SUBMAP_TIED && news >= Some(NEWS_MIN);
+        if is_tied && !is_news {
+            return None;
+        }
+        // Loops of our own come first: they take no keypoints.
+        let share = news.filter(|_| !is_loop).map_or(1.0, |news| news / (1.0 + news));
+        Some(0.5 * worth * share / (1 + self.blobs_lacking(candidate, stated)) as f64)
+    }
+
+    /// Whether the two submaps overlap, as far as one can tell from where they are.
+    fn may_touch(&self, (a, b): Pair, at_a: &Relative, at_b: &Relative) -> bool {
+        let (at_a, at_b) = (at_a.sim(), at_b.sim());
+        (at_a.translation - at_b.translation).norm() <= at_a.scale * self.reach(a) + at_b.scale * self.reach(b)
+    }
+
+    /// How far from its anchor a submap may still overlap another, in its frame's unit: half its extent.
+    fn reach(&self, id: SubmapId) -> f64 {
+        let [x, y, z] = self.knowledge.submap(id).map_or([0.0; 3], |fact| fact.extent).map(f64::from);
+        0.5 * (x * x + y * y + z * z).sqrt()
+    }
+
+    /// Keypoint blobs that must be sent, as far as we know, for both ends to look at a pair.
+    fn blobs_lacking(&self, Candidate { mine, theirs, .. }: &Candidate, stated: &Stated) -> usize {
+        if self.is_loop(*mine, *theirs) {
+            return 0;
+        }
+        let is_here = self.knowledge.submap(*theirs).is_some_and(|known| {
+            self.negotiation.keypoints(known.blob).is_some() || self.gossip.blob(known.blob).is_some()
+        });
+        usize::from(!is_here) + usize::from(stated.of_submap(*mine, theirs.frame) == 0)
+    }
+
+    /// `t_own_anchor` by the joint estimate, if the submap is connected to us.
+    fn anchor(&self, id: SubmapId) -> Option<&Relative> {
+        self.map.solved.anchors.get(&id)
+    }
+}
+
+/// The least that the standard deviation of two anchors' distance vector can be, over all axes, in the unit of the frame that
+/// both are given in: the difference of those of their positions (triangle inequality in L²), whatever they share.
+fn drift_between(a: &Relative, b: &Relative) -> f64 {
+    let sigma = |t: &Relative| t.sim().scale * t.translation_variance().sqrt();
+    (sigma(a) - sigma(b)).abs()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3};
+    use nalgebra::Vector3;
+
+    fn pose() -> Se3 {
+        Se3::new(So3::identity(), Vector3::new(1.0, 2.0, 3.0))
+    }
+
+    fn metric(sigma: f64) -> Relative {
+        let covariance = Covariance::from_sigmas([sigma; 6]).unwrap();
+        Relative::Metric(PoseWithCovariance { pose: pose(), covariance })
+    }
+
+    /// A frame whose unit is half of ours: what it takes for a metre is half of one.
+    #[test]
+    fn drift_is_told_in_the_unit_of_the_frame_that_both_are_given_in() {
+        let small = {
+            let covariance = Covariance::from_sigmas([0.4; 7]).unwrap();
+            let sim = Sim3::new(pose().rotation, pose().translation, 0.5);
+            Relative::Similarity(SimWithCovariance { sim, covariance })
+        };
+        let off = |a: &Relative, b: &Relative, sigma: f64| (drift_between(a, b) - 3.0f64.sqrt() * sigma).abs();
+        assert!(off(&metric(0.5), &metric(0.2), 0.3) < 1e-12);
+        assert!(off(&metric(0.2), &metric(0.5), 0.3) < 1e-12);
+        assert!(off(&metric(0.5), &small, 0.3) < 1e-12, "{}", drift_between(&metric(0.5), &small));
+    }
+}
