@@ -2,7 +2,6 @@
 //! and verified.
 
 use super::Agent;
-use super::allowance::FACT_BYTES;
 use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Look, Measured};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
@@ -134,16 +133,17 @@ impl Agent {
 
     fn start_proposing(&mut self, active: &[Proposal]) {
         self.negotiation.begun.retain(|begun| active.iter().any(|p| pair_of(p.mine, p.theirs) == *begun));
-        for &Proposal { mine, theirs, may_wait } in active {
+        for &Proposal { mine, theirs, may_wait, bytes } in active {
             if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
                 break;
             }
             let pair = pair_of(mine, theirs);
-            if may_wait && !self.negotiation.begun.contains(&pair) {
-                if !self.allowance.may_spend(self.now) {
+            if !self.negotiation.begun.contains(&pair) {
+                if may_wait && !self.allowance.may_spend(self.now) {
                     continue;
                 }
                 self.negotiation.begun.insert(pair);
+                self.allowance.spend(self.now, bytes);
             }
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
             let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);
@@ -310,7 +310,6 @@ impl Agent {
         let blob = |id| self.knowledge.submap(id).map(|fact| fact.blob);
         let (Some(blob_i), Some(blob_j)) = (blob(i), blob(j)) else { return };
         self.event(Event::AlignmentProposed { i, j, support: measured.support });
-        self.allowance.spend(self.now, FACT_BYTES);
         let fact = Fact::Alignment(AlignmentFact {
             i,
             j,
@@ -324,7 +323,6 @@ impl Agent {
     }
 
     fn write_verdict(&mut self, alignment: EntryId, outcome: VerdictOutcome) {
-        self.allowance.spend(self.now, FACT_BYTES);
         self.write(self.me.frame.epoch, &Fact::Verdict(VerdictFact { alignment, outcome }));
     }
 

@@ -296,7 +296,6 @@ impl Agent {
             return self.negotiation.fetch_failed(query, self.now);
         }
         fetch.got.extend_from_slice(piece);
-        self.allowance.spend(self.now, piece.len());
         self.gossip.traffic.not_postponed(hash);
         if fetch.got.len() < total as usize {
             fetch.query = None;

@@ -104,7 +104,7 @@ pub struct Negotiation {
     pub out_of_reach: BTreeSet<Hash>,
     /// Jobs under way.
     pub running: BTreeMap<JobId, Work>,
-    /// Pairs that were let through to spend keypoints on, and not tried yet.
+    /// Pairs that were let through and paid for, and not tried yet.
     pub begun: BTreeSet<Pair>,
     /// Something changed that may make work startable.
     stirred: bool,
