@@ -4,19 +4,17 @@
 use super::Agent;
 use super::allowance::FACT_BYTES;
 use super::knowledge::{Agreement, Pair, pair_of};
-use super::negotiation::{ALIGNMENTS_PER_FRAME_PAIR, TRIES_PER_SUBMAP_TIED};
+use super::negotiation::TRIES_PER_SUBMAP_TIED;
 use super::shortlist::Candidate;
 use super::stated::Stated;
 use crate::geometry::Relative;
-use crate::ids::{FrameId, SubmapId};
+use crate::ids::SubmapId;
 
 /// Two frames that are tied well enough as such are aligned further where a submap has drifted from the other by this many
 /// standard deviations of an alignment.
 const NEWS_MIN: f64 = 1.0;
 /// Alignments, in units of what it takes to merge, after which two frames that still have not merged may wait with more.
 const MERGE_ATTEMPTS: usize = 2;
-/// Frames that a robot joins at once; with the others it may wait, as most will have joined those in the meantime.
-const JOINED_AT_ONCE: usize = 2;
 
 /// A pair worth trying.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,17 +32,9 @@ impl Agent {
     pub(super) fn active_candidates(&self) -> Vec<Proposal> {
         let stated = self.stated();
         let enough = MERGE_ATTEMPTS * self.config.estimate.alignments_min;
-        let is_joined = |frame| self.map.solved.frames.get(&frame).is_some_and(|placed| placed.t_own_frame.is_some());
-        // Those that should have joined by now first: the joint estimate is about to tell.
-        let partners = stated.partners(self.me.frame).filter(|(frame, count)| *count >= enough && !is_joined(*frame));
-        let mut joining: Vec<FrameId> = partners.map(|(frame, _)| frame).collect();
         let proposal = |candidate: Candidate| {
             let Candidate { mine, theirs, .. } = candidate;
-            let may_join = !self.are_connected(mine, theirs) && stated.between(pair_of(mine, theirs)) < enough;
-            if may_join && joining.len() < JOINED_AT_ONCE && !joining.contains(&theirs.frame) {
-                joining.push(theirs.frame);
-            }
-            let joins = may_join && joining.contains(&theirs.frame);
+            let joins = !self.are_connected(mine, theirs) && stated.between(pair_of(mine, theirs)) < enough;
             let lacking = self.blobs_lacking(&candidate, &stated);
             // Theirs is about as long as ours.
             let blob = self.knowledge.submap(mine).and_then(|known| self.gossip.blob(known.blob));
@@ -57,7 +47,8 @@ impl Agent {
     /// Active candidates without those that are put off until more may be spent: they are no work left to do.
     pub(super) fn proposals(&self) -> usize {
         let may_spend = self.allowance.has_some(self.now);
-        self.active_candidates().iter().filter(|proposal| may_spend || !proposal.may_wait).count()
+        let is_begun = |p: &Proposal| self.negotiation.begun.contains(&pair_of(p.mine, p.theirs));
+        self.active_candidates().iter().filter(|p| may_spend || !p.may_wait || is_begun(p)).count()
     }
 
     /// Whether the joint estimate knows how the two submaps lie.
@@ -90,9 +81,7 @@ impl Agent {
         let is_tied = stated.is_tied(pair);
         let worth = candidate.similarity + if candidate.wished { 0.5 } else { 0.0 };
         let Some((at_a, at_b)) = self.anchor(pair.0).zip(self.anchor(pair.1)) else {
-            // What was begun is brought to an end first.
-            let begun = stated.between(pair) as f64 / ALIGNMENTS_PER_FRAME_PAIR as f64;
-            return (!is_tied).then_some(1.5 + worth + begun);
+            return (!is_tied).then_some(1.5 + worth);
         };
         if !self.may_touch(pair, at_a, at_b) {
             return None;

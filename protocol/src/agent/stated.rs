@@ -49,12 +49,6 @@ impl Stated {
         self.of_frames.get(&(i.frame, j.frame)).map_or(0, |of| of.count)
     }
 
-    /// The other frames that a frame has alignments with, and how many.
-    pub(super) fn partners(&self, of: FrameId) -> impl Iterator<Item = (FrameId, usize)> + '_ {
-        let others = self.of_frames.iter().filter(move |((i, j), _)| i != j && (*i == of || *j == of));
-        others.map(move |((i, j), between)| (if *i == of { *j } else { *i }, between.count))
-    }
-
     /// Whether two frames are tied well enough as such.
     pub(super) fn is_tied(&self, pair: Pair) -> bool {
         self.between(pair) >= ALIGNMENTS_PER_FRAME_PAIR
