@@ -1,12 +1,11 @@
 //! Which pairs of submaps are worth aligning, in what order, and who begins (DESIGN §6).
 //!
-//! A hash of the pair decides the responsible endpoint, so exactly one begins. Candidates are ranked by expected gain:
-//! pairs of frames that are not merged yet first, then by similarity of the summaries. Pairs that the joint estimate
-//! places out of reach of one another, and submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant.
-//! Two frames with [`ALIGNMENTS_PER_FRAME_PAIR`] alignments are tied well enough as such; after that only submaps are
-//! aligned that have drifted from one another by the joint estimate, a robot's own first, which cost no radio: without
-//! these the map of a long drive would become that of its odometry. Every pair is tried once; every foreign alignment that
-//! names us is verified once.
+//! A hash of the pair decides the responsible endpoint, so exactly one begins. Candidates are ranked by what they promise
+//! for the bytes they cost ([`ranking`](super::ranking)). Pairs that the joint estimate places out of reach of one another,
+//! and submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant. Two frames with
+//! [`ALIGNMENTS_PER_FRAME_PAIR`] alignments are tied well enough as such; after that only submaps are aligned that have
+//! drifted from one another by the joint estimate: without these the map of a long drive would become that of its
+//! odometry. Every pair is tried once; every foreign alignment that names us is verified once.
 
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
