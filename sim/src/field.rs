@@ -143,10 +143,52 @@ impl Field {
         (0..place.len()).map(|a| (0..place.len()).filter(|b| near(a, *b)).collect()).collect()
     }
 
+    /// Contact returns: where those who run fall into groups that do not hear one another, each group gets into touch
+    /// with the nearest of those that are joined already, the largest group being the first of these.
+    pub fn join(&self, place: &[usize], runs: &[bool], reach: &mut [Vec<usize>]) {
+        let mut groups = groups(reach, runs);
+        groups.sort_by_key(|group| core::cmp::Reverse(group.len()));
+        let mut groups = groups.into_iter();
+        let Some(mut joined) = groups.next() else { return };
+        for group in groups {
+            let pairs = group.iter().flat_map(|a| joined.iter().map(move |b| (*a, *b)));
+            let apart = |&(a, b): &(usize, usize)| {
+                let (p, q) = (self.robots[place[a]].at, self.robots[place[b]].at);
+                libm::hypot(p[0] - q[0], p[1] - q[1])
+            };
+            if let Some((a, b)) = pairs.min_by(|one, other| apart(one).total_cmp(&apart(other))) {
+                for (hears, heard) in [(a, b), (b, a)] {
+                    let at = reach[hears].partition_point(|other| *other < heard);
+                    reach[hears].insert(at, heard);
+                }
+            }
+            joined.extend(group);
+        }
+    }
+
     /// Whether links change with time.
     pub fn moves(&self) -> bool {
         !matches!(self.layout, Layout::Grid | Layout::Mesh)
     }
+}
+
+/// Those who run, in groups within which messages can go from each to each, over others if need be.
+fn groups(reach: &[Vec<usize>], runs: &[bool]) -> Vec<Vec<usize>> {
+    let mut waits = runs.to_vec();
+    let mut groups = Vec::new();
+    for first in 0..reach.len() {
+        if !core::mem::take(&mut waits[first]) {
+            continue;
+        }
+        let mut group = vec![first];
+        let mut next = 0;
+        while let Some(&robot) = group.get(next) {
+            next += 1;
+            group.extend(reach[robot].iter().filter(|other| core::mem::take(&mut waits[**other])));
+        }
+        groups.push(group);
+    }
+    groups
 }
 
 #[cfg(test)]
@@ -165,6 +207,32 @@ mod tests {
             assert!(heard.iter().all(|other| reach[*other].contains(&robot)), "both ways");
         }
         assert!(reach[44].contains(&100) && reach[100].contains(&44));
+    }
+
+    #[test]
+    fn when_contact_returns_all_who_run_can_be_told_and_no_link_is_lost() {
+        let layout = Layout::Waypoints { side_m: 100.0, range_m: 8.0, speed_m_s: 5.0 };
+        let mut apart = 0;
+        for seed in 0..20 {
+            let field = Field::new(layout, 60, seed);
+            let place: Vec<usize> = (0..60).collect();
+            let runs: Vec<bool> = (0..60).map(|robot| robot % 7 != 3).collect();
+            let before = field.reach(&place);
+            let mut after = before.clone();
+            field.join(&place, &runs, &mut after);
+            apart += groups(&before, &runs).len() - 1;
+            assert_eq!(groups(&after, &runs).len(), 1, "seed {seed}");
+            for (robot, heard) in after.iter().enumerate() {
+                assert!(heard.is_sorted() && before[robot].iter().all(|other| heard.contains(other)));
+                assert!(heard.iter().all(|other| after[*other].contains(&robot)), "both ways");
+                assert!(runs[robot] || *heard == before[robot], "the dead carry nothing");
+            }
+            let links = |reach: &[Vec<usize>]| reach.iter().map(Vec::len).sum::<usize>();
+            assert_eq!(links(&after) - links(&before), 2 * (groups(&before, &runs).len() - 1), "no more than needed");
+        }
+        assert!(apart > 100, "{apart}");
+        let mut none: Vec<Vec<usize>> = Vec::new();
+        Field::new(layout, 0, 1).join(&[], &[], &mut none);
     }
 
     #[test]

@@ -209,7 +209,7 @@ impl<C: Core> Swarm<C> {
         Ok(())
     }
 
-    /// All faults stop, whoever stood still starts again, and disks that refused have room.
+    /// All faults stop, whoever stood still starts again, disks that refused have room, and contact returns.
     pub(super) fn heal(&mut self, now: Instant) -> Result<(), SwarmError> {
         self.healed = true;
         self.network.heal();
@@ -220,6 +220,7 @@ impl<C: Core> Swarm<C> {
             });
             self.boot(now, robot)?;
         }
+        self.reach();
         self.update_hearing(now);
         Ok(())
     }

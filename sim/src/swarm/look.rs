@@ -46,12 +46,19 @@ impl<C: Core> Swarm<C> {
         self.queue.push(now.after(millis(1e3 * TICK)), Event::Move);
     }
 
-    /// Tells the network who is in reach of whom. Where all are, it knows.
+    /// Tells the network who is in reach of whom. Where all are, it knows. Once all is healed, no robot is out of reach of
+    /// all others: whom nobody hears, nobody can be asked to have told.
     pub(super) fn reach(&mut self) {
-        if self.scenario.radio != Layout::Mesh {
-            let place: Vec<usize> = (0..self.robots.len()).map(|robot| self.drives(robot)).collect();
-            self.network.set_reach(self.field.reach(&place));
+        if self.scenario.radio == Layout::Mesh {
+            return;
         }
+        let place: Vec<usize> = (0..self.robots.len()).map(|robot| self.drives(robot)).collect();
+        let mut reach = self.field.reach(&place);
+        if self.healed {
+            let runs: Vec<bool> = self.robots.iter().map(|robot| robot.core.is_some()).collect();
+            self.field.join(&place, &runs, &mut reach);
+        }
+        self.network.set_reach(reach);
     }
 
     pub(super) fn sample(&mut self, now: Instant) {
