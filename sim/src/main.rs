@@ -14,6 +14,7 @@ use merganser_sim::scenario::Scenario;
 use merganser_sim::svg::picture;
 use merganser_sim::swarm::{Outcome, Swarm};
 use merganser_sim::vopr::command::{self, VoprArgs};
+use merganser_sim::world::trajectory::Trajectory;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -25,6 +26,8 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 /// The scenario that the demo's recordings are made from, and the seed.
 const DEMO: &str = include_str!("../scenarios/three.toml");
 const DEMO_SEED: u64 = 1;
+/// The scenario for recorded drives.
+const STREETS: &str = include_str!("../scenarios/streets.toml");
 
 /// The Merganser core on a virtual network, in virtual time.
 #[derive(Debug, Parser)]
@@ -55,7 +58,7 @@ enum Command {
     },
     /// Attack swarms: draw networks, machines and faults from seeds, and check every invariant
     Vopr(VoprArgs),
-    /// Write the demo's three recordings, the same bytes each time
+    /// Write recordings for `merganser demo --data`, the same bytes each time: the demo's three, if not told otherwise
     Record {
         /// Where the recordings' folders go
         #[arg(long, value_name = "DIR")]
@@ -63,9 +66,13 @@ enum Command {
         /// The seed
         #[arg(long, default_value_t = DEMO_SEED)]
         seed: u64,
-        /// Another scenario than the demo's
+        /// Another scenario than the demo's (with --along: than sim/scenarios/streets.toml)
         #[arg(long)]
         scenario: Option<PathBuf>,
+        /// Robots drive along this recorded trajectory, cut into a stretch for each: lines `stamp x y z qx qy qz qw`
+        /// (TUM, KITTI's LiDAR poses), perhaps packed (.xz)
+        #[arg(long, value_name = "FILE")]
+        along: Option<PathBuf>,
     },
     /// Measure the estimators: success, honesty and time
     #[command(subcommand)]
@@ -87,17 +94,14 @@ fn dispatch(command: Command) -> anyhow::Result<bool> {
     match command {
         Command::Vopr(args) => command::run(&args),
         Command::Bench(what) => bench::run(what),
-        Command::Record { out, seed, scenario } => {
-            let scenario = match scenario {
-                Some(path) => load(&path)?,
-                None => Scenario::parse(DEMO)?,
+        Command::Record { out, seed, scenario, along } => {
+            let scenario = match (scenario, &along) {
+                (Some(path), _) => load(&path)?,
+                (None, Some(_)) => Scenario::parse(STREETS)?,
+                (None, None) => Scenario::parse(DEMO)?,
             };
-            for done in record(&scenario, seed, &out)? {
-                say(&format!(
-                    "{:<8} {} keyframes, {} points, {:.1} m in {:.1} s, {} bytes",
-                    done.robot, done.keyframes, done.points, done.metres, done.secs, done.bytes
-                ))?;
-            }
+            let along = along.map(|path| Trajectory::read(&path)).transpose()?;
+            write_recordings(&scenario, along.as_ref(), seed, &out)?;
             Ok(true)
         }
         Command::Run { scenario: path, seed, seeds, report, twice } => {
@@ -115,6 +119,22 @@ fn dispatch(command: Command) -> anyhow::Result<bool> {
             Ok(good)
         }
     }
+}
+
+fn write_recordings(scenario: &Scenario, along: Option<&Trajectory>, seed: u64, out: &Path) -> anyhow::Result<()> {
+    let bar = progress_bar(0, "keyframes")?;
+    let recorded = record(scenario, along, seed, out, |done, all| {
+        bar.set_length(all as u64);
+        bar.set_position(done as u64);
+    });
+    bar.finish_and_clear();
+    for done in recorded? {
+        say(&format!(
+            "{:<8} {} keyframes, {} points, {:.1} m in {:.1} s, {} bytes",
+            done.robot, done.keyframes, done.points, done.metres, done.secs, done.bytes
+        ))?;
+    }
+    Ok(())
 }
 
 fn load(path: &Path) -> anyhow::Result<Scenario> {

@@ -1,9 +1,10 @@
-//! Writing the demo's recordings: what each robot of a scenario drives and sees, in the format of
+//! Writing recordings, the demo's among them: what each robot of a scenario drives and sees, in the format of
 //! `merganser_protocol::recording`, with the truth beside it. One seed gives the same bytes on every machine: all noise
 //! is seeded, all floats are printed with a fixed number of digits, and clouds are whole numbers of 2 mm.
 
 use crate::scenario::Scenario;
 use crate::stage::Stage;
+use crate::world::trajectory::Trajectory;
 use core::fmt::Write as _;
 use merganser_protocol::geometry::{Covariance, Se3};
 use merganser_protocol::ids::{Name, NameError};
@@ -56,21 +57,42 @@ pub struct Recorded {
     pub secs: f64,
 }
 
-/// Writes one folder per robot of the scenario into `out`.
+/// Writes one folder per robot of the scenario into `out`; robots drive `along` a recorded drive, if there is one. Tells
+/// `progress` how many of how many keyframes are done.
 ///
 /// # Errors
 /// [`RecordError`]; what was written before stays.
-pub fn record(scenario: &Scenario, seed: u64, out: &Path) -> Result<Vec<Recorded>, RecordError> {
-    let stage = Stage::new(scenario, seed)?;
-    (0..scenario.robots).map(|robot| record_robot(scenario, &stage, seed, robot, out)).collect()
+pub fn record(
+    scenario: &Scenario,
+    along: Option<&Trajectory>,
+    seed: u64,
+    out: &Path,
+    mut progress: impl FnMut(usize, usize),
+) -> Result<Vec<Recorded>, RecordError> {
+    let (stage, place) = match along {
+        Some(drive) => (Stage::along(scenario, drive, seed)?, format!(" along {}", drive.name())),
+        None => (Stage::new(scenario, seed)?, String::new()),
+    };
+    let origin = format!(
+        "made by merganser-sim record, scenario {}{place}, seed {seed}; seeded odometry drift, stated covariance",
+        scenario.name
+    );
+    let all = (0..scenario.robots).map(|robot| stage.steps(robot).len()).sum();
+    let mut done = 0;
+    let mut one = || {
+        done += 1;
+        progress(done, all);
+    };
+    (0..scenario.robots).map(|robot| record_robot(scenario, &stage, &origin, robot, out, &mut one)).collect()
 }
 
 fn record_robot(
     scenario: &Scenario,
     stage: &Stage,
-    seed: u64,
+    origin: &str,
     robot: usize,
     out: &Path,
+    progress: &mut impl FnMut(),
 ) -> Result<Recorded, RecordError> {
     let name = &stage.names()[robot];
     let folder = out.join(name);
@@ -92,17 +114,18 @@ fn record_robot(
         let covariance = numbers(&triangle(&step.motion.covariance), true);
         let _ = writeln!(keyframes, "{stamp},{odometry},{covariance},{cloud}");
         let _ = writeln!(truth, "{stamp},{}", numbers(&pose(&step.t_world_body), false));
+        progress();
     }
     put(folder.join("keyframes.csv"), keyframes.as_bytes())?;
     put(folder.join("truth.csv"), truth.as_bytes())?;
-    put(folder.join("recording.toml"), manifest(scenario, seed, name, steps.len())?.as_bytes())?;
+    put(folder.join("recording.toml"), manifest(scenario, origin, name, steps.len())?.as_bytes())?;
     done.keyframes = steps.len();
     done.metres = scenario.drive.keyframe_m * steps.len().saturating_sub(1) as f64;
     done.secs = steps.last().map_or(0.0, |step| step.nanos as f64 * 1e-9);
     Ok(done)
 }
 
-fn manifest(scenario: &Scenario, seed: u64, name: &str, keyframes: usize) -> Result<String, RecordError> {
+fn manifest(scenario: &Scenario, origin: &str, name: &str, keyframes: usize) -> Result<String, RecordError> {
     let manifest = Manifest {
         format: FORMAT.to_owned(),
         version: VERSION,
@@ -111,10 +134,7 @@ fn manifest(scenario: &Scenario, seed: u64, name: &str, keyframes: usize) -> Res
         covariance_of: CovarianceOf::Motion,
         clouds: CloudFormat::XyzI16,
         keyframes,
-        origin: format!(
-            "made by merganser-sim record, scenario {}, seed {seed}; seeded odometry drift, stated covariance",
-            scenario.name
-        ),
+        origin: origin.to_owned(),
         config: scenario.config.clone(),
     };
     Ok(toml::to_string(&manifest)?)

@@ -7,6 +7,7 @@ use crate::world::World;
 use crate::world::drive::{Step, drive};
 use crate::world::path::Path;
 use crate::world::sensor::Sensor;
+use crate::world::trajectory::{Trajectory, TrajectoryError};
 use merganser_protocol::geometry::CovarianceError;
 use thiserror::Error;
 
@@ -23,15 +24,18 @@ pub struct Stage {
 }
 
 /// Why a stage could not be set.
-#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+#[derive(Debug, Error)]
 pub enum StageError {
     /// The drift cannot be stated as a covariance.
     #[error("drive: {0}; choose drift noise between 1e-6 and 10")]
     Drift(#[from] CovarianceError),
+    /// The recorded drive is too short for so many robots.
+    #[error(transparent)]
+    Trajectory(#[from] TrajectoryError),
 }
 
 impl Stage {
-    /// Sets the stage.
+    /// Sets the stage; each robot drives a loop of its own.
     ///
     /// # Errors
     /// [`StageError`] if the drift options are out of any covariance's range.
@@ -42,7 +46,19 @@ impl Stage {
             Path::of_robot(robot, options.loop_radius_m, options.loop_spread_m, &mut dice)
         };
         let paths: Vec<Path> = (0..scenario.robots).map(path).collect();
-        let world = World::generate(options, &paths, seed);
+        Self::of(scenario, &paths, seed)
+    }
+
+    /// Sets the stage; each robot drives its stretch of a recorded drive.
+    ///
+    /// # Errors
+    /// [`StageError`] as for [`new`](Self::new), or if the drive is too short for so many robots.
+    pub fn along(scenario: &Scenario, trajectory: &Trajectory, seed: u64) -> Result<Self, StageError> {
+        Self::of(scenario, &trajectory.cut(scenario.robots)?, seed)
+    }
+
+    fn of(scenario: &Scenario, paths: &[Path], seed: u64) -> Result<Self, StageError> {
+        let world = World::generate(&scenario.world, paths, seed);
         let one = |(robot, path)| {
             let mut dice = Dice::new(seed, &format!("drive {robot}"));
             drive(&scenario.drive, path, scenario.duration_secs, &mut dice)

@@ -8,6 +8,7 @@ use merganser_protocol::recording::{
 use merganser_sim::record::record;
 use merganser_sim::scenario::Scenario;
 use merganser_sim::stage::Stage;
+use merganser_sim::world::trajectory::Trajectory;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -43,7 +44,7 @@ fn rows(text: &str, header: &str) -> Vec<Vec<String>> {
 fn what_is_written_is_what_was_driven() {
     let folder = tempfile::tempdir().unwrap();
     let (scenario, seed) = (demo(), 7);
-    let done = record(&scenario, seed, folder.path()).unwrap();
+    let done = record(&scenario, None, seed, folder.path(), |_, _| {}).unwrap();
     let stage = Stage::new(&scenario, seed).unwrap();
     assert!(done.iter().map(|d| d.bytes).sum::<u64>() <= 3 << 20);
     for (robot, name) in stage.names().iter().enumerate() {
@@ -90,7 +91,7 @@ fn what_is_written_is_what_was_driven() {
 fn the_same_seed_gives_the_same_bytes() {
     let [one, two, other] = [3, 3, 4].map(|seed| {
         let folder = tempfile::tempdir().unwrap();
-        record(&demo(), seed, folder.path()).unwrap();
+        record(&demo(), None, seed, folder.path(), |_, _| {}).unwrap();
         files(folder.path())
     });
     assert_eq!(one, two);
@@ -98,8 +99,42 @@ fn the_same_seed_gives_the_same_bytes() {
 }
 
 #[test]
+fn a_recorded_drive_is_driven_in_a_town() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("drive.txt");
+    // Round a block of 40 m and round it again.
+    let corner = |k: i32| [[0, 0], [40, 0], [40, 40], [0, 40]][usize::try_from(k.rem_euclid(4)).unwrap()];
+    let line = |k| format!("{k} {} {} 0 0 0 0 1\n", corner(k)[0], corner(k)[1]);
+    std::fs::write(&file, (0..=8).map(line).collect::<String>()).unwrap();
+    let drive = Trajectory::read(&file).unwrap();
+    let mut scenario = Scenario::parse(include_str!("../scenarios/streets.toml")).unwrap();
+    scenario.robots = 2;
+    let mut last = (0, 0);
+    let out = folder.path().join("out");
+    let done = record(&scenario, Some(&drive), 5, &out, |done, all| last = (done, all)).unwrap();
+    assert_eq!(last, (162, 162), "a keyframe every 2 m of 160 m each, both ends");
+    for robot in &done {
+        assert_eq!((robot.keyframes, robot.metres), (81, 160.0));
+        assert!(robot.points > 81 * 4000, "{}", robot.points);
+        let manifest: Manifest =
+            toml::from_str(&std::fs::read_to_string(out.join(&robot.robot).join("recording.toml")).unwrap()).unwrap();
+        assert!(manifest.origin.contains("along drive.txt, seed 5"), "{}", manifest.origin);
+    }
+    // The second lap is the other robot's, in the same street.
+    let truth = |robot: &str| std::fs::read_to_string(out.join(robot).join("truth.csv")).unwrap();
+    let place = |text: String, row: usize| -> [f64; 2] {
+        let row = text.lines().nth(row + 1).unwrap().split(',').map(|v| v.parse().unwrap()).collect::<Vec<f64>>();
+        [row[1], row[2]]
+    };
+    for row in [0, 30, 80] {
+        let [a, b] = ["alpha", "beta"].map(|robot| place(truth(robot), row));
+        assert!((a[0] - b[0]).hypot(a[1] - b[1]) < 1e-6, "{a:?} {b:?}");
+    }
+}
+
+#[test]
 fn a_folder_that_cannot_be_written_is_named() {
     let file = tempfile::NamedTempFile::new().unwrap();
-    let error = record(&demo(), 1, file.path()).unwrap_err().to_string();
+    let error = record(&demo(), None, 1, file.path(), |_, _| {}).unwrap_err().to_string();
     assert!(error.contains(&*file.path().to_string_lossy()), "{error}");
 }

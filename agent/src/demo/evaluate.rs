@@ -25,6 +25,20 @@ pub struct Bounds {
     pub rotation_deg: f64,
 }
 
+/// What a good odometry drifts, share of the way and degrees per metre. A frame lies where its robot set out; seen from
+/// where two robots met, it is as far off as the odometry from there to there.
+const DRIFT: (f64, f64) = (0.005, 0.002);
+
+impl Bounds {
+    /// These bounds, but no less than odometry drifts on drives of so many metres.
+    pub fn for_drives_of(self, metres: f64) -> Self {
+        Self {
+            translation_m: self.translation_m.max(DRIFT.0 * metres),
+            rotation_deg: self.rotation_deg.max(DRIFT.1 * metres),
+        }
+    }
+}
+
 /// An estimate's error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseError {
@@ -247,8 +261,9 @@ fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: &Bounds) ->
     for pair in pairs {
         let [a, b] = &pair.robots;
         let Bounds { translation_m, rotation_deg } = bounds;
-        let what =
-            format!("{a}–{b}: error at most {translation_m} m and {rotation_deg}°, and inside the 99.9 % ellipsoid");
+        let what = format!(
+            "{a}–{b}: error at most {translation_m:.2} m and {rotation_deg:.1}°, and inside the 99.9 % ellipsoid"
+        );
         let (held, found) = match &pair.error {
             None => (false, "no alignment of the frames, or no truth".into()),
             Some(e) => (

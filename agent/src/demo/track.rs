@@ -28,6 +28,11 @@ impl Track {
         }
     }
 
+    /// The way by odometry, m.
+    pub fn driven_m(&self) -> f64 {
+        self.odometry.windows(2).map(|two| (two[1].translation - two[0].translation).norm()).sum()
+    }
+
     /// `t_world_frame`: where the robot's local frame truly lies. A frame is defined by its first keyframe, where the
     /// odometry has not drifted yet.
     pub fn t_world_frame(&self) -> Option<Se3> {

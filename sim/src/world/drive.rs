@@ -58,7 +58,7 @@ pub struct Step {
     pub t_frame_body: Se3,
 }
 
-/// The keyframes of one robot's drive along `path` for `secs` seconds.
+/// The keyframes of one robot's drive along `path`, for `secs` seconds or to its end.
 ///
 /// # Errors
 /// [`CovarianceError`] if the drift options give a noise that no covariance can hold.
@@ -66,7 +66,7 @@ pub fn drive(options: &DriveOptions, path: &Path, secs: f64, dice: &mut Dice) ->
     let sway = Sway::new(options.tilt_deg, dice);
     let mut steps: Vec<Step> = Vec::new();
     let (mut distance, mut time) = (0.0, 0.0);
-    while time <= secs {
+    while time <= secs && path.end().is_none_or(|end| distance <= end) {
         let t_world_body = sway.pose(path, distance);
         let (motion, t_frame_body) = match steps.last() {
             None => {

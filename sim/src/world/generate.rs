@@ -4,6 +4,7 @@
 use super::WorldOptions;
 use super::path::Path;
 use super::shape::Shape;
+use super::streets;
 use crate::dice::Dice;
 use core::f64::consts::{PI, TAU};
 use libm::{cos, sin};
@@ -13,10 +14,14 @@ const PANEL_M: f64 = 1.2;
 
 /// All solids of a world.
 pub fn shapes(options: &WorldOptions, paths: &[Path], dice: &mut Dice) -> Vec<Shape> {
+    let is_clear = |shape: &Shape| is_clear(shape, paths, options.clearance_m);
+    if options.streets {
+        return streets::shapes(paths, dice).into_iter().filter(is_clear).collect();
+    }
     let area = Area::around(paths, options.margin_m);
     let mut shapes = outer_wall(&area, dice);
     let furniture = if options.aliased { repeated(options, &area, dice) } else { unique(options, &area, dice) };
-    shapes.extend(furniture.into_iter().filter(|shape| is_clear(shape, paths, options.clearance_m)));
+    shapes.extend(furniture.into_iter().filter(is_clear));
     shapes
 }
 

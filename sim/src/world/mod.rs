@@ -1,6 +1,7 @@
 //! The world robots drive through: a ground plane, walls with gaps, pillars and boxes of many sizes and orientations,
 //! all drawn from a seed, and a ray-cast range sensor in it. By default no two places look alike; with `aliased`, the
-//! same furnished cell repeats on a lattice, so that one place looks like another.
+//! same furnished cell repeats on a lattice, so that one place looks like another; with `streets`, a town stands along
+//! the robots' paths.
 
 pub mod drive;
 mod generate;
@@ -8,6 +9,8 @@ mod grid;
 pub mod path;
 pub mod sensor;
 pub mod shape;
+mod streets;
+pub mod trajectory;
 
 use crate::dice::Dice;
 use grid::Grid;
@@ -38,6 +41,8 @@ pub struct WorldOptions {
     pub aliased: bool,
     /// Edge of that cell, m.
     pub cell_m: f64,
+    /// Houses, cars and trees along the robots' paths, and nothing else: no hall, none of the above.
+    pub streets: bool,
 }
 
 impl Default for WorldOptions {
@@ -52,6 +57,7 @@ impl Default for WorldOptions {
             walls_per_100m2: 1.2,
             aliased: false,
             cell_m: 8.0,
+            streets: false,
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Where robots drive: smooth closed loops, one per robot, laid out on a sunflower spiral so that each overlaps its
-//! neighbours. Neighbours drive in opposite directions and start elsewhere, so places are seen with other headings.
+//! neighbours (neighbours drive in opposite directions and start elsewhere, so places are seen with other headings), or
+//! stretches of a recorded drive.
 
 use crate::dice::Dice;
 use core::f64::consts::TAU;
@@ -9,13 +10,20 @@ use libm::{atan2, cos, sin, sqrt};
 const CORNERS: usize = 720;
 /// Turn between successive loop centres (the golden angle), rad.
 const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
+/// Corners of a recorded drive are this far apart, m.
+const DRIVE_STEP_M: f64 = 0.5;
+/// The heading is that of a chord as long as a robot, not of one polyline edge, so that it has no steps, m...
+const LOOP_CHORD_M: f64 = 0.4;
+/// ...and on a recorded drive of one as long as a car, whose recorded poses are about a metre apart, m.
+const DRIVE_CHORD_M: f64 = 4.0;
 
-/// A closed loop on the ground, parametrised by arc length.
+/// A closed loop or a stretch on the ground, parametrised by arc length.
 #[derive(Clone, Debug)]
 pub struct Path {
     corners: Vec<[f64; 2]>,
-    /// Arc length at each corner; the last is the whole loop's.
+    /// Arc length at each corner; the last is the whole path's.
     lengths: Vec<f64>,
+    is_closed: bool,
 }
 
 impl Path {
@@ -36,35 +44,56 @@ impl Path {
         Self::closed(corners.collect())
     }
 
+    /// The drive along these points, at least two, no two in a row the same.
+    pub fn along(points: &[[f64; 2]]) -> Self {
+        let rough = Self::of(points.to_vec(), false);
+        rough.stretch(0.0, rough.length())
+    }
+
+    /// The part of a path that ends between `from` and `to`, m along it.
+    pub fn stretch(&self, from: f64, to: f64) -> Self {
+        let steps = libm::ceil((to - from) / DRIVE_STEP_M).max(1.0);
+        let corner = |k: usize| self.point(from + (to - from) * k as f64 / steps);
+        Self::of((0..=steps as usize).map(corner).collect(), false)
+    }
+
     fn closed(mut corners: Vec<[f64; 2]>) -> Self {
         corners.push(corners[0]);
+        Self::of(corners, true)
+    }
+
+    fn of(corners: Vec<[f64; 2]>, is_closed: bool) -> Self {
         let mut lengths = vec![0.0];
         let mut length = 0.0;
         for pair in corners.windows(2) {
             length += distance(pair[0], pair[1]);
             lengths.push(length);
         }
-        Self { corners, lengths }
+        Self { corners, lengths, is_closed }
     }
 
-    /// Length of the loop, m.
+    /// Where the path ends, m along it; a loop does not.
+    pub fn end(&self) -> Option<f64> {
+        (!self.is_closed).then(|| self.length())
+    }
+
+    /// Length of the path, of a loop that of one lap, m.
     pub fn length(&self) -> f64 {
         self.lengths.last().copied().unwrap_or(0.0)
     }
 
-    /// Position and heading (rad) after `distance` m, lap after lap.
+    /// Position and heading (rad) after `distance` m; of a loop lap after lap.
     pub fn at(&self, distance: f64) -> ([f64; 2], f64) {
-        // The heading is that of a chord as long as a robot, not of one polyline edge, so that it has no steps.
-        const CHORD_M: f64 = 0.2;
-        let ahead = self.point(distance + CHORD_M);
-        let behind = self.point(distance - CHORD_M);
+        let half = if self.is_closed { LOOP_CHORD_M } else { DRIVE_CHORD_M } / 2.0;
+        let ahead = self.point(distance + half);
+        let behind = self.point(distance - half);
         (self.point(distance), atan2(ahead[1] - behind[1], ahead[0] - behind[0]))
     }
 
     fn point(&self, distance: f64) -> [f64; 2] {
         let lap = self.length();
-        let s = distance - lap * libm::floor(distance / lap);
-        let edge = self.lengths.partition_point(|&l| l <= s).clamp(1, CORNERS) - 1;
+        let s = if self.is_closed { distance - lap * libm::floor(distance / lap) } else { distance.clamp(0.0, lap) };
+        let edge = self.lengths.partition_point(|&l| l <= s).clamp(1, self.corners.len() - 1) - 1;
         let share = (s - self.lengths[edge]) / (self.lengths[edge + 1] - self.lengths[edge]);
         let (a, b) = (self.corners[edge], self.corners[edge + 1]);
         [a[0] + (b[0] - a[0]) * share, a[1] + (b[1] - a[1]) * share]
