@@ -5,6 +5,7 @@ use crate::config::{FileConfig, FileConfigError};
 use crate::driver::{Clock, Core, Driver, Finished, Parts, Snapshots};
 use crate::journal::{self, Start};
 use crate::link::Link;
+use crate::link::scouting::Scouting;
 use crate::link::session::LinkError;
 use crate::queue::{Inbox, queue};
 use crate::store;
@@ -72,6 +73,7 @@ pub struct Host {
     driver: JoinHandle<Finished>,
     stop: oneshot::Sender<()>,
     link: Link,
+    scouting: Option<Scouting>,
 }
 
 impl Host {
@@ -115,6 +117,7 @@ impl Host {
         let wait = Duration::from_millis(config.store.commit_ms);
         let store = store::Writer::spawn(store, wait, move |done| deliver.deliver(done));
         let store = store.map_err(|e| refused("thread", e))?;
+        let scouting = Scouting::begin(&config.zenoh);
         let (opened, network) = Link::open(config, inbox.clone()).await?;
         let (jobs, own) = (config.driver.jobs, inbox.clone());
         let (driver, snapshots) = Driver::new(Parts { core, network, store, journal, outbox, inbox: own, clock, jobs });
@@ -124,7 +127,7 @@ impl Host {
         }));
         let link = opened.start(snapshots.clone()).await?;
         info!(robot = %config.robot, swarm = %config.swarm, listen = ?config.zenoh.listen, "agent runs");
-        Ok(Self { inbox, snapshots, driver, stop, link })
+        Ok(Self { inbox, snapshots, driver, stop, link, scouting })
     }
 
     /// The way to the core.
@@ -135,6 +138,11 @@ impl Host {
     /// What the core believes.
     pub fn snapshots(&self) -> &Snapshots {
         &self.snapshots
+    }
+
+    /// Where Zenoh scouts, if it does; for the one who asks first.
+    pub fn take_scouting(&mut self) -> Option<Scouting> {
+        self.scouting.take()
     }
 
     /// Waits until the driver ends by itself, which it does only by a mistake of ours.

@@ -4,6 +4,8 @@ use super::{runtime, say};
 use crate::config::FileConfig;
 use crate::driver::Finished;
 use crate::host::{Host, Options};
+use crate::link::scouting::Scouting;
+use crate::link::session::{self, LinkError};
 use crate::queue::{Drops, Inbox};
 use crate::recording::Recording;
 use crate::telemetry;
@@ -77,13 +79,16 @@ async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recordin
     if let Some(recording) = &recording {
         suit(&mut config, recording);
     }
+    let names_peers = !session::others(&config.zenoh).is_empty();
     let mut host = Host::start(config, Options { journal: args.journal.clone(), seed: args.seed }).await?;
     let inbox = host.inbox().clone();
     let drops = tokio::spawn(tell_drops(inbox.drops.clone()));
     let feed = tokio::spawn(feed(inbox, args.new_epoch, recording, args.speed));
     let feeding = feed.abort_handle();
+    let scouting = host.take_scouting();
     let ended = tokio::select! {
         () = stop => Ok(()),
+        error = astray(scouting, names_peers) => Err(error.into()),
         () = let_go(args.leash) => Ok(()),
         error = host.broken() => return Err(error.into()),
         bad = bad_feed(feed) => Err(bad),
@@ -105,6 +110,22 @@ async fn let_go(leash: bool) {
         let _ = receiver.await;
     } else {
         std::future::pending().await
+    }
+}
+
+/// Completes when this host has an address from which Zenoh will never scout. Whoever names peers is told and goes on: these
+/// are called again and again, from wherever we are.
+async fn astray(scouting: Option<Scouting>, names_peers: bool) -> LinkError {
+    let Some(mut scouting) = scouting else { return std::future::pending().await };
+    loop {
+        let place = scouting.outgrown().await;
+        if !names_peers {
+            return LinkError::Astray { place };
+        }
+        warn!(
+            %place,
+            "a new address: peers that zenoh.connect does not name are not found from there until the agent starts again"
+        );
     }
 }
 

@@ -25,9 +25,9 @@ pub struct Bounds {
     pub rotation_deg: f64,
 }
 
-/// What a good odometry drifts, share of the way and degrees per metre. A frame lies where its robot set out; seen from
-/// where two robots met, it is as far off as the odometry from there to there.
-const DRIFT: (f64, f64) = (0.005, 0.002);
+/// Twice what a good odometry drifts, share of the way and degrees per metre. A frame lies where its robot set out; seen
+/// from where two robots met, it is as far off as the odometry from there to there.
+const DRIFT: (f64, f64) = (0.01, 0.004);
 
 impl Bounds {
     /// These bounds, but no less than odometry drifts on drives of so many metres.

@@ -262,9 +262,9 @@ fn each_check_bites() {
     assert!(broken(&turn(1.49), wide).is_empty());
     assert_eq!(broken(&turn(1.51), wide).len(), 3);
     // A frame that a long drive set out from may be off by what the odometry drifts, and no more.
-    assert_eq!(BOUNDS.for_drives_of(30.0), BOUNDS);
+    assert_eq!(BOUNDS.for_drives_of(15.0), BOUNDS);
     let long = BOUNDS.for_drives_of(1000.0);
-    assert!((long.translation_m - 5.0).abs() < 1e-12 && (long.rotation_deg - 2.0).abs() < 1e-12);
+    assert!((long.translation_m - 10.0).abs() < 1e-12 && (long.rotation_deg - 4.0).abs() < 1e-12);
     // Small, but claimed to be much smaller.
     let narrow = |views: &mut Vec<Views>| {
         for pair in views.iter_mut().flat_map(|v| &mut v.frames.pairs) {

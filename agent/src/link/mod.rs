@@ -4,6 +4,7 @@
 
 mod hear;
 mod say;
+pub mod scouting;
 pub mod session;
 mod views;
 

@@ -3,6 +3,7 @@
 
 use crate::config::{Mode, ZenohConfig};
 use crate::keys;
+use crate::link::scouting::Place;
 use serde_json::{Value, json};
 use std::time::Duration;
 use thiserror::Error;
@@ -31,6 +32,15 @@ pub enum LinkError {
         listen: Vec<String>,
         /// What Zenoh said.
         reason: String,
+    },
+    /// Peers can be found by scouting alone, and scouting goes on where this host is no more.
+    #[error(
+        "this host has a new address, {place}, and Zenoh scouts from those that it had when the agent started: it would \
+         find nobody. Start the agent again (a service manager does), or name peers in zenoh.connect"
+    )]
+    Astray {
+        /// The new address.
+        place: Place,
     },
     /// A declaration is refused.
     #[error("zenoh refuses to serve {key}: {reason}")]
@@ -125,7 +135,7 @@ pub fn in_words(error: impl std::fmt::Display) -> String {
 }
 
 /// The connect list without ourselves, so that all robots can share one list.
-fn others(config: &ZenohConfig) -> Vec<&String> {
+pub fn others(config: &ZenohConfig) -> Vec<&String> {
     config.connect.iter().filter(|endpoint| !config.listen.contains(endpoint)).collect()
 }
 

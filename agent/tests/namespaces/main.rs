@@ -139,6 +139,23 @@ fn a_robot_that_gets_another_address_is_linked_again() {
 
 #[test]
 #[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+fn a_robot_that_only_scouts_ends_where_its_address_is_new_and_is_found_when_started_again() {
+    let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
+    let mut fleet = Fleet::scout(&air, 3.0);
+    fleet.until_all("everybody hears everybody", |seen| seen.neighbours().len() == 2);
+    fleet.gamma().until("gamma writes", |seen| seen.own_submaps("gamma") >= 1);
+    let new = air.readdress("gamma");
+    let (ended, told) = fleet.gamma().end();
+    assert_eq!(ended.code(), Some(1), "{told}");
+    assert!(told.contains(&format!("{new} on radio")) && told.contains("zenoh.connect"), "{told}");
+
+    fleet.gamma().start(None); // as its service manager does; its SLAM stays away
+    fleet.gamma().until("gamma hears the others from its new address", |seen| seen.neighbours().len() == 2);
+    fleet.end_alike();
+}
+
+#[test]
+#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
 fn a_loss_of_5_percent_changes_nothing() {
     lossy(5);
 }

@@ -42,13 +42,23 @@ impl<'a> Fleet<'a> {
     /// Three agents as a swarm is recommended to be set up (a full connect list and multicast), each fed with its
     /// recording, `speed` times faster than it was driven.
     pub fn drive(air: &'a Air, speed: f64) -> Self {
+        Self::start(air, speed, true)
+    }
+
+    /// The same without a connect list.
+    pub fn scout(air: &'a Air, speed: f64) -> Self {
+        Self::start(air, speed, false)
+    }
+
+    fn start(air: &'a Air, speed: f64, names_peers: bool) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let names = name_list();
         let configs = swarm(folder.path(), &names);
         let endpoint = |name: &&str| format!("tcp/{}:{PORT}", air.address(name));
         let connect: Vec<String> = names.iter().map(endpoint).collect();
         let robots = configs.into_iter().map(|config| {
-            let others = connect.iter().filter(|other| **other != endpoint(&config.robot.as_str()));
+            let own = endpoint(&config.robot.as_str());
+            let others = connect.iter().filter(|other| names_peers && **other != own);
             let others = others.cloned().collect();
             Robot::new(air, folder.path(), config, others)
         });
@@ -185,7 +195,7 @@ impl<'a> Robot<'a> {
             self.keyframes = table.lines().count() as u64 - 1;
             command.args(["--speed", &speed.to_string(), "--recording"]).arg(recording);
         }
-        let log = File::options().create(true).append(true).open(self.log()).unwrap();
+        let log = File::options().create(true).append(true).open(log(&self.home, &self.name)).unwrap();
         command.stdin(Stdio::piped()).stdout(log.try_clone().unwrap()).stderr(log);
         self.agent = Some(Process(command.spawn().unwrap()));
     }
@@ -195,6 +205,21 @@ impl<'a> Robot<'a> {
         let mut agent = self.agent.take().unwrap();
         agent.0.kill().unwrap();
         agent.0.wait().unwrap()
+    }
+
+    /// Waits until the agent ends by itself; how, and the last that it wrote.
+    pub fn end(&mut self) -> (ExitStatus, String) {
+        let began = Instant::now();
+        let agent = self.agent.as_mut().unwrap();
+        let ended = loop {
+            if let Some(ended) = agent.0.try_wait().unwrap() {
+                break ended;
+            }
+            assert!(began.elapsed() < PATIENCE, "{} does not end\n{}", self.name, log_tail(&self.home, &self.name));
+            sleep(LOOK_EVERY);
+        };
+        self.agent = None;
+        (ended, self.log_tail())
     }
 
     /// What is seen from now on, as soon as it is.
@@ -248,15 +273,19 @@ impl<'a> Robot<'a> {
         v4.lines().chain(v6.lines()).filter_map(address).collect()
     }
 
-    fn log(&self) -> PathBuf {
-        self.home.join(format!("{}.log", self.name))
-    }
-
     fn log_tail(&self) -> String {
-        let text = fs::read_to_string(self.log()).unwrap_or_default();
-        let lines: Vec<&str> = text.lines().collect();
-        format!("--- {}\n{}\n", self.name, lines[lines.len().saturating_sub(20)..].join("\n"))
+        log_tail(&self.home, &self.name)
     }
+}
+
+fn log(home: &Path, name: &str) -> PathBuf {
+    home.join(format!("{name}.log"))
+}
+
+fn log_tail(home: &Path, name: &str) -> String {
+    let text = fs::read_to_string(log(home, name)).unwrap_or_default();
+    let lines: Vec<&str> = text.lines().collect();
+    format!("--- {name}\n{}\n", lines[lines.len().saturating_sub(20)..].join("\n"))
 }
 
 /// Notes what the spectator says until it ends.
