@@ -107,7 +107,8 @@ pub struct ZenohConfig {
     pub multicast: bool,
     /// Let neighbours tell of neighbours (Zenoh's gossip scouting).
     pub gossip: bool,
-    /// Interface for multicast scouting, or `auto`.
+    /// Interface for multicast scouting, or `auto`: every one that has an IPv4 address. An agent that names no peers in
+    /// `connect` ends, to be started again, when one of them gets another address.
     pub interface: String,
     /// Interfaces over which `…/in/*` is accepted: this host's loopbacks, unless the SLAM runs on another computer.
     pub input_interfaces: Vec<String>,

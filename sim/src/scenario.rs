@@ -49,7 +49,7 @@ pub struct Scenario {
     /// What lies between them.
     #[serde(default)]
     pub network: NetworkOptions,
-    /// Who is in reach of whom: all, unless told otherwise.
+    /// Who is in reach of whom: all, unless told otherwise. Once faults are over, nobody is out of reach of all others.
     #[serde(default)]
     pub radio: Layout,
     /// Their computers.

@@ -11,6 +11,8 @@ use thiserror::Error;
 pub const BYTES_MAX: u64 = 64 << 20;
 /// Widest and deepest trajectory, m: the world's grid has a cell for each square metre.
 pub const SIDE_MAX_M: f64 = 2_000.0;
+/// Longest drive, m: whatever is built is kept off every metre of it.
+pub const LENGTH_MAX_M: f64 = 50_000.0;
 /// Shortest stretch for one robot, m.
 pub const STRETCH_MIN_M: f64 = 10.0;
 /// Points closer than this to the one before are left out: whoever stands still turns by the noise of his poses alone, m.
@@ -93,6 +95,7 @@ impl Trajectory {
         }
         let mut points: Vec<[f64; 2]> = Vec::new();
         let mut first = None;
+        let mut length = 0.0;
         for (index, line) in text.lines().enumerate() {
             let line = line.trim();
             if line.is_empty() || line.starts_with('#') {
@@ -109,7 +112,11 @@ impl Trajectory {
                 )));
             }
             if moved >= STILL_M {
+                length += if points.is_empty() { 0.0 } else { moved };
                 points.push(here);
+            }
+            if length > LENGTH_MAX_M {
+                return Err(at(format!("goes on beyond {:.0} km; cut it", LENGTH_MAX_M / 1e3)));
             }
         }
         let side = |axis: usize| {
@@ -183,6 +190,12 @@ mod tests {
         let wide = |metres: usize| (0..=metres).step_by(50).map(|x| format!("0 {x} 0 0 0 0 0 1\n")).collect::<String>();
         assert!(refusal(&wide(2050)).contains("reaches over 2050 m"));
         assert!(Trajectory::parse("x", &wide(2000)).is_ok());
+        let rounds = |metres: u32| {
+            let there_and_back = |k: u32| format!("0 {} 0 0 0 0 0 1\n", if k % 2 == 0 { 0 } else { 50 });
+            (0..=metres / 50).map(there_and_back).collect::<String>()
+        };
+        assert!(Trajectory::parse("x", &rounds(50_000)).is_ok());
+        assert!(refusal(&rounds(50_050)).starts_with("line 1002: goes on beyond 50 km"));
         let short = Trajectory::parse("x", &wide(50)).unwrap();
         assert!(short.cut(5).is_ok() && short.cut(6).unwrap_err().to_string().contains("50 m for 6 robots"));
         assert!(matches!(Trajectory::read(FilePath::new("/no/such")), Err(TrajectoryError::Io { .. })));
