@@ -191,7 +191,7 @@ mod tests {
         assert!(refusal(&wide(2050)).contains("reaches over 2050 m"));
         assert!(Trajectory::parse("x", &wide(2000)).is_ok());
         let rounds = |metres: u32| {
-            let there_and_back = |k: u32| format!("0 {} 0 0 0 0 0 1\n", if k % 2 == 0 { 0 } else { 50 });
+            let there_and_back = |k: u32| format!("0 {} 0 0 0 0 0 1\n", if k.is_multiple_of(2) { 0 } else { 50 });
             (0..=metres / 50).map(there_and_back).collect::<String>()
         };
         assert!(Trajectory::parse("x", &rounds(50_000)).is_ok());
