@@ -328,7 +328,7 @@ impl<C: Core, N: Network> Driver<C, N> {
 fn tell(event: &Event) {
     match event {
         Event::Rejected { name, reason, suppressed, .. } => warn!(peer = name, reason, suppressed, "refused input"),
-        Event::ReceiveOnly { reason } => error!(reason, "the store fails: receive-only until it works again"),
+        Event::ReceiveOnly { reason } => error!(reason, "receive-only: nothing new of this robot is written"),
         Event::StoreHealed => warn!("the store works again; nothing was lost"),
         Event::Merged { frame } => info!(%frame, "merged"),
         Event::Unmerged { frame } => warn!(%frame, "no longer merged"),

@@ -121,8 +121,7 @@ pub struct AlignConfig {
     /// Similarity of summaries (0 to 1) from which a pair is a candidate.
     pub similarity_min: f64,
     /// Bytes of keypoints and facts per second, in the mean, for aligning further what has merged already: a longer drive
-    /// and a surer map. Until two frames have merged they are aligned as fast as the link lets. A pair that costs more than a
-    /// minute of this is let off with a minute's.
+    /// and a surer map. Until two frames have merged they are aligned as fast as the link lets.
     pub further_bytes_per_sec: f64,
 }
 

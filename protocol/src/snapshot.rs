@@ -77,7 +77,8 @@ pub struct StatusView {
     pub idle: bool,
     /// Names of robots of which at least one frame is merged with this robot's present frame.
     pub merged_with: Vec<String>,
-    /// The store fails: nothing new of our own is begun, and nothing received counts, until it works again.
+    /// Nothing new of our own is begun. The store fails, and nothing received counts until it works again; or this robot
+    /// began more epochs than the others take. Its log says which.
     pub receive_only: bool,
 }
 

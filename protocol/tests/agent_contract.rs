@@ -4,16 +4,20 @@
 mod common;
 
 use common::{Wires, World, agent, drive, name, robot};
-use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Output, QueryKind, Record};
+use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Output, QueryKind, Record, Sighting};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::ids::{FrameId, Hash, Name, RobotId};
 use merganser_protocol::replica::Replica;
-use merganser_protocol::time::Instant;
+use merganser_protocol::time::{Instant, Stamp};
 use merganser_protocol::wire::EntryBytes;
 use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
 use merganser_protocol::wire::limits::BLOB_PIECE_LEN;
 use merganser_protocol::wire::messages::Message;
 use std::time::Duration;
+
+fn name_of_swarm() -> Name {
+    common::identity(0).swarm
+}
 
 fn drain(agent: &mut Agent) -> Vec<Output> {
     std::iter::from_fn(|| agent.poll_output()).collect()
@@ -119,8 +123,7 @@ fn blobs_come_in_paced_pieces_and_whole() {
     config.submap.keypoints = 1024;
     config.gossip.blob_bytes_per_sec = 50_000.0;
     let pause = Duration::from_secs_f64(BLOB_PIECE_LEN as f64 / config.gossip.blob_bytes_per_sec);
-    let agent = |k| Agent::new(config.clone(), common::identity(k), 42, Restored::default(), Instant::ZERO).unwrap();
-    let mut wires = Wires::new((0..2).map(agent).collect());
+    let mut wires = Wires::new((0..2).map(|k| common::agent_of(k, &config)).collect());
     for k in 0..2 {
         drive(&world, k, 12).0.into_iter().for_each(|keyframe| wires.input(k, Input::Keyframe(keyframe)));
         wires.input(k, Input::Command(Command::Flush));
@@ -188,7 +191,7 @@ fn a_slow_disk_bounds_what_waits_for_it_and_nothing_is_lost() {
     let mut agent = agent(0, Restored::default());
     let key = ed25519_dalek::SigningKey::from_bytes(&common::secret(1));
     let roster = [(name(1), common::public(1))];
-    let mut theirs = Replica::new(&Name::new("test").unwrap(), roster, &common::config().gossip).unwrap();
+    let mut theirs = Replica::new(&name_of_swarm(), roster, &common::config().gossip).unwrap();
     let verdict = Fact::Verdict(VerdictFact {
         alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: robot(1), epoch: 1 }, seq: 0 },
         outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
@@ -206,8 +209,20 @@ fn a_slow_disk_bounds_what_waits_for_it_and_nothing_is_lost() {
         }));
         (batches.len() as u64, batches.last().copied().unwrap_or_default())
     };
-    let waiting = facts.iter().map(|bytes| hear(&mut agent, bytes)).last().unwrap();
+    let sees = |agent: &mut Agent, reason: &str| {
+        let (robot, covariance) = (name(1), [0.0; 21]);
+        let t_body_other = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+        let sighting = Sighting { stamp: Stamp(0), robot, t_body_other, covariance };
+        agent.handle(Instant::ZERO, Input::Sighting(sighting));
+        let _ = drain(agent);
+        agent.snapshot(Instant::ZERO).stats.rejected.get(reason).copied()
+    };
+    let (all_but_one, others) = facts.split_at(MAX as usize - 1);
+    all_but_one.iter().for_each(|bytes| _ = hear(&mut agent, bytes));
+    assert_eq!(sees(&mut agent, "sighting: overload"), None, "there is room for it, whatever else is wrong with it");
+    let waiting = others.iter().map(|bytes| hear(&mut agent, bytes)).last().unwrap();
     assert_eq!(waiting.0, MAX);
+    assert_eq!(sees(&mut agent, "sighting: overload"), Some(1));
     assert_eq!(agent.snapshot(Instant::ZERO).stats.rejected["facts: overload"], 10);
     // The disk comes back: what was refused comes again.
     agent.handle(Instant::ZERO, Input::Persisted { up_to: waiting.1 });
@@ -257,6 +272,70 @@ fn a_full_disk_turns_the_agent_into_a_listener_and_says_so() {
     assert!(healed.iter().any(|o| matches!(o, Output::Event(Event::StoreHealed))));
     assert!(healed.iter().any(|o| matches!(o, Output::Run { .. })), "{healed:?}");
     assert!(!agent.status().receive_only);
+}
+
+#[test]
+fn a_robot_at_its_last_epoch_writes_and_beyond_it_only_listens_and_says_why() {
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    let mut config = common::config();
+    config.gossip.epochs_per_robot_max = 2;
+    let mut wires = Wires::new(vec![common::agent_of(0, &config)]);
+    let drive_and_end = |wires: &mut Wires| {
+        keyframes.iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe.clone())));
+        wires.input(0, Input::Command(Command::NewEpoch));
+    };
+    let is_told = |wires: &Wires| wires.events.iter().any(|(_, event)| matches!(event, Event::ReceiveOnly { .. }));
+    drive_and_end(&mut wires);
+    assert!(!wires.agents[0].status().receive_only && !is_told(&wires), "the second epoch is its last");
+    drive_and_end(&mut wires);
+    assert_eq!(wires.agents[0].heads().count(), 2);
+    assert!(wires.agents[0].status().receive_only && is_told(&wires));
+    let (kept, taken) = (wires.disks[0].len(), wires.agents[0].status().keyframes);
+    drive_and_end(&mut wires);
+    let status = wires.agents[0].status();
+    assert_eq!((wires.disks[0].len(), status.keyframes, status.unsaved), (kept + 1, taken, 0), "but the epoch's end");
+    let refused = wires.agents[0].snapshot(wires.now).stats.rejected["keyframe: receive-only"];
+    assert_eq!(refused, keyframes.len() as u64);
+    // What others write is heard and kept.
+    let other = agent(1, Restored::default());
+    wires = Wires::new(vec![wires.agents.remove(0), other]);
+    keyframes.iter().for_each(|keyframe| wires.input(1, Input::Keyframe(keyframe.clone())));
+    wires.input(1, Input::Command(Command::Flush));
+    wires.run(Duration::from_secs(5));
+    assert_eq!(wires.agents[0].heads().count(), 3);
+}
+
+#[test]
+fn no_epoch_comes_after_the_last() {
+    let mut agent = agent(0, Restored { records: vec![], fresh_epoch: u32::MAX - 2 });
+    let mut status = || {
+        agent.handle(Instant::ZERO, Input::Command(Command::NewEpoch));
+        let is_told = drain(&mut agent).iter().any(|output| matches!(output, Output::Event(Event::ReceiveOnly { .. })));
+        (agent.frame().epoch, agent.status().receive_only, is_told)
+    };
+    assert_eq!(status(), (u32::MAX - 1, false, false));
+    assert_eq!(status(), (u32::MAX, true, true));
+}
+
+#[test]
+fn the_end_of_an_own_past_whose_beginning_is_yet_to_come_closes_it() {
+    let key = ed25519_dalek::SigningKey::from_bytes(&common::secret(0));
+    let mut past = Replica::new(&name_of_swarm(), [(name(0), common::public(0))], &common::config().gossip).unwrap();
+    let verdict = Fact::Verdict(VerdictFact {
+        alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: robot(1), epoch: 1 }, seq: 0 },
+        outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
+    });
+    let entries: Vec<Vec<u8>> = (0..3).map(|_| past.append(&key, 9, &verdict).unwrap().encode()).collect();
+    // The store was lost, and the clock went back.
+    let mut wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 2 })]);
+    let bytes = Message::Facts(vec![EntryBytes(entries[2].clone())]).encode();
+    wires.input(0, Input::Received { from: robot(1), channel: Channel::Facts, bytes });
+    assert_eq!(wires.agents[0].frame().epoch, 10);
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    keyframes.into_iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe)));
+    wires.input(0, Input::Command(Command::Flush));
+    let rejected = wires.agents[0].snapshot(wires.now).stats.rejected;
+    assert!(wires.agents[0].status().submaps > 1 && rejected.is_empty(), "nothing of ours is refused: {rejected:?}");
 }
 
 #[test]

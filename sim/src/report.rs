@@ -81,6 +81,7 @@ impl Report {
             at: outcome.ended,
             phase: Phase::End,
             robots: outcome.robots.clone(),
+            down: Vec::new(),
             truth: &outcome.truth,
             expect: &outcome.scenario.expect,
         };

@@ -238,7 +238,7 @@ fn draw(swarm: &Name, robots: &BTreeMap<Name, Seen>) -> String {
         let Some((when, s)) = &seen.status else { continue };
         let state = match () {
             () if when.elapsed() > SILENT => "silent".into(),
-            () if s.receive_only => style("receive-only: store fails").red().to_string(),
+            () if s.receive_only => style("receive-only: see its log").red().to_string(),
             () if s.idle => "idle".into(),
             () => s.pending.to_string(),
         };

@@ -159,7 +159,7 @@ pub fn missing(tracks: &[Track], statuses: &[Option<&merganser_protocol::snapsho
             lines.push(format!("{name} still works ({} pending)", status.pending));
         }
         if status.receive_only {
-            lines.push(format!("{name} cannot write its store"));
+            lines.push(format!("{name} is receive-only; its log says why"));
         }
     }
     let mut digests: Vec<&str> = statuses.iter().flatten().map(|status| status.digest.as_str()).collect();

@@ -300,7 +300,7 @@ fn what_is_missing_is_said() {
     assert_eq!(told(&|v| v[1].status.merged_with = vec!["alpha".into()]), "beta has not merged with gamma");
     assert_eq!(told(&|v| (v[0].status.idle, v[0].status.pending) = (false, 4)), "alpha still works (4 pending)");
     assert_eq!(told(&|v| v[2].status.digest = "ef".into()), "the robots do not hold the same facts yet");
-    assert_eq!(told(&|v| v[2].status.receive_only = true), "gamma cannot write its store");
+    assert_eq!(told(&|v| v[2].status.receive_only = true), "gamma is receive-only; its log says why");
     assert_eq!(missing(&tracks[..1], &[None]), ["alpha does not answer"]);
 }
 

@@ -49,7 +49,8 @@ impl Medium for FileMedium {
             let kept = self.beside(".damaged");
             match fs::remove_file(&kept) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-                _ => fs::hard_link(&self.path, &kept)?,
+                // Where there are no links (FAT), a copy does.
+                _ => fs::hard_link(&self.path, &kept).or_else(|_| fs::copy(&self.path, &kept).map(drop))?,
             }
         }
         // One step: a crash leaves the one or the other at the path, never neither.

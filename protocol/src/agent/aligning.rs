@@ -94,7 +94,7 @@ impl Agent {
     /// Starts as many alignments as allowed: answers owed first, then the most promising candidates.
     pub(super) fn start_aligning(&mut self) {
         let further = self.allowance.take_due(self.now);
-        if (self.negotiation.take_stirred() || further) && !self.receive_only {
+        if (self.negotiation.take_stirred() || further) && !self.is_receive_only() {
             self.start_verifying();
             if self.has_room() || !self.negotiation.fetches.is_empty() {
                 let active = self.active_candidates();
@@ -139,11 +139,12 @@ impl Agent {
             }
             let pair = pair_of(mine, theirs);
             if !self.negotiation.begun.contains(&pair) {
-                if may_wait && !self.allowance.may_spend(self.now) {
-                    continue;
+                match may_wait {
+                    true if !self.allowance.may_spend(self.now) => continue,
+                    true => self.allowance.spend(self.now, bytes),
+                    false => self.allowance.owe(self.now, bytes),
                 }
                 self.negotiation.begun.insert(pair);
-                self.allowance.spend(self.now, bytes);
             }
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
             let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);

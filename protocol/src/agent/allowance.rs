@@ -35,10 +35,17 @@ impl Allowance {
         self.bucket.due(now, 0.0) <= now
     }
 
-    /// So many bytes were spent, allowed or not.
+    /// So many bytes were spent, as [`Allowance::may_spend`] allowed. They are owed in full: one pair may cost more than is
+    /// ever saved up.
     pub fn spend(&mut self, now: Instant, bytes: usize) {
-        let left = self.bucket.level(now) - bytes as f64;
-        self.bucket.set(now, left.max(-self.bucket.full()));
+        self.bucket.set(now, self.bucket.level(now) - bytes as f64);
+    }
+
+    /// So many bytes were spent on what need not wait. Of such debts no more than [`SAVED_SECS_MAX`] are kept.
+    pub fn owe(&mut self, now: Instant, bytes: usize) {
+        let level = self.bucket.level(now);
+        let bound = level.min(-self.bucket.full());
+        self.bucket.set(now, (level - bytes as f64).max(bound));
     }
 
     /// When what was put off may be done.
@@ -71,8 +78,16 @@ mod tests {
         let due = start.after(Duration::from_secs(5));
         assert_eq!(allowance.timeout(start), Some(due));
         assert!(allowance.take_due(due) && !allowance.take_due(due) && allowance.may_spend(due));
-        allowance.spend(due, usize::MAX);
+        allowance.spend(due, 20_000);
+        let owed = |secs| Some(due.after(Duration::from_secs(secs)));
         assert!(!allowance.may_spend(due));
-        assert_eq!(allowance.timeout(due), Some(due.after(Duration::from_secs_f64(SAVED_SECS_MAX))));
+        assert_eq!(allowance.timeout(due), owed(200), "in full");
+        allowance.owe(due, 1_000);
+        assert_eq!(allowance.timeout(due), owed(200), "nothing more, and nothing less");
+        let later = due.after(Duration::from_secs(200));
+        allowance.owe(later, 5_000);
+        assert_eq!(allowance.timeout(later), owed(250));
+        allowance.owe(later, usize::MAX);
+        assert_eq!(allowance.timeout(later), owed(260), "a minute's debt");
     }
 }

@@ -43,7 +43,7 @@ impl Agent {
         let wanted = self.config.gossip.condense_entries;
         let Some(held) = self.replica.settled(frame) else { return };
         let count = held.end - held.start;
-        if wanted == 0 || self.receive_only || count < wanted.max(self.condensing.again_at) {
+        if wanted == 0 || self.is_receive_only() || count < wanted.max(self.condensing.again_at) {
             return;
         }
         self.condensing.again_at = count.saturating_mul(2);

@@ -5,6 +5,7 @@
 use super::Agent;
 use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
 use super::knowledge::{Pair, pair_of};
+use super::ledger::BATCHES_WAITING_MAX;
 use super::traffic::{Traffic, is_piece};
 use crate::config::GossipConfig;
 use crate::gossip::{Answer, Class, Spread, Step};
@@ -14,12 +15,10 @@ use crate::wire::limits::BLOB_PIECE_LEN;
 use crate::wire::messages::{AlignStatus, Message};
 use crate::wire::{Beacon, BeaconContent};
 use core::time::Duration;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Raw blobs kept in memory to serve others.
 pub const BLOBS_MAX: usize = 2_048;
-/// Batches on their way to the disk beyond which facts of others are refused for now: a slow disk bounds the memory.
-pub const BATCHES_WAITING_MAX: usize = 1_024;
 /// Shortest time between two wishes ([`Message::AlignRequest`]).
 const WISH_EVERY: Duration = Duration::from_secs(2);
 
@@ -96,9 +95,16 @@ impl Gossip {
         self.blobs.get(&hash).map(Vec::as_slice)
     }
 
-    pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>) {
+    /// Keeps a blob. Beyond [`BLOBS_MAX`] one goes that is not among `ours`, which are called for only then: what others
+    /// made they can serve themselves.
+    pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>, ours: impl FnOnce() -> BTreeSet<Hash>) {
         if self.blobs.len() >= BLOBS_MAX && !self.blobs.contains_key(&hash) {
-            self.blobs.pop_first();
+            let ours = ours();
+            let foreign = self.blobs.keys().find(|hash| !ours.contains(hash)).copied();
+            match foreign {
+                Some(foreign) => _ = self.blobs.remove(&foreign),
+                None => _ = self.blobs.pop_first(),
+            }
         }
         self.blobs.insert(hash, bytes);
     }
@@ -189,7 +195,7 @@ impl Agent {
         self.stats.received(message.kind(), bytes.len());
         match (channel, message) {
             (Channel::Pose, Message::Pose(beacon)) => self.on_beacon(from, &beacon),
-            (Channel::Facts, Message::Facts(_)) if self.ledger.waiting.len() >= BATCHES_WAITING_MAX => {
+            (Channel::Facts, Message::Facts(_)) if self.is_overloaded() => {
                 // Nothing is lost: it comes again when the sets are compared.
                 let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk");
                 self.reject(Some(from), "facts: overload", &detail);

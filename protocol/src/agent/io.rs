@@ -279,7 +279,8 @@ pub enum Event {
         /// Refusals of the same peer not reported one by one.
         suppressed: u64,
     },
-    /// Storage failed; until it works again the agent hears, solves and serves what is durable, and no more.
+    /// Nothing of our own can be written: storage failed, and until it works again the agent hears, solves and serves what
+    /// is durable, and no more; or we began more epochs than others take, and only a new key helps.
     ReceiveOnly {
         /// Why.
         reason: String,

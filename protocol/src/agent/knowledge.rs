@@ -181,6 +181,11 @@ impl Knowledge {
         self.submaps.range(end(0, 0)..=end(u32::MAX, u32::MAX)).map(|(id, known)| (*id, &**known))
     }
 
+    /// The keypoint blobs of a robot's submaps.
+    pub fn blobs_of(&self, robot: RobotId) -> BTreeSet<Hash> {
+        self.submaps_of(robot).map(|(_, known)| known.blob).collect()
+    }
+
     /// One submap.
     pub fn submap(&self, id: SubmapId) -> Option<&Known> {
         self.submaps.get(&id).map(|known| &**known)

@@ -3,6 +3,7 @@
 use super::Agent;
 use super::io::{Event, JobId, Record, Sighting};
 use super::job::{DescribeJob, Job};
+use super::ledger::BATCHES_WAITING_MAX;
 use crate::config::SubmapConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use crate::ids::{Hash, SubmapId};
@@ -46,6 +47,9 @@ impl Mapper {
 
 impl Agent {
     pub(super) fn on_keyframe(&mut self, keyframe: Keyframe) {
+        if let Some(error) = self.epoch_limit() {
+            return self.reject(Some(self.me.robot), "keyframe: receive-only", &error.to_string());
+        }
         if self.mapper.queue.len() >= DESCRIBE_QUEUE_MAX {
             let detail = format!("{DESCRIBE_QUEUE_MAX} submaps wait to be described; raise submap.distance_m");
             self.reject(Some(self.me.robot), "keyframe: overload", &detail);
@@ -74,7 +78,8 @@ impl Agent {
 
     /// One submap is described at a time, so that facts are written in order.
     pub(super) fn start_describing(&mut self) {
-        if self.mapper.describing.is_some() || self.receive_only {
+        // Beyond the epoch limit no keyframe is taken: what waits here is of epochs that can still be written.
+        if self.mapper.describing.is_some() || self.ledger.fails {
             return;
         }
         if let Some((id, submap)) = self.mapper.queue.pop_front() {
@@ -131,7 +136,7 @@ impl Agent {
     pub(super) fn keep_blob(&mut self, bytes: Vec<u8>) {
         let hash = Hash::of(&bytes);
         if self.keep_keypoints(hash, &bytes) {
-            self.gossip.add_blob(hash, bytes);
+            self.gossip.add_blob(hash, bytes, || self.knowledge.blobs_of(self.me.robot));
         }
     }
 
@@ -152,8 +157,12 @@ impl Agent {
 
     /// A direct measurement of another robot, carried from the two bodies to the anchors they are known by.
     pub(super) fn on_sighting(&mut self, sighting: &Sighting) {
-        if self.receive_only {
-            return self.reject(Some(self.me.robot), "sighting: store", "the store fails; it cannot be kept");
+        if self.is_receive_only() {
+            return self.reject(Some(self.me.robot), "sighting: receive-only", "it cannot be kept now");
+        }
+        if self.is_overloaded() {
+            let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk; the store is too slow");
+            return self.reject(Some(self.me.robot), "sighting: overload", &detail);
         }
         match self.sighting_fact(sighting) {
             Ok(fact) => self.write(self.me.frame.epoch, &Fact::Sighting(fact)),

@@ -18,6 +18,7 @@ pub mod job;
 #[cfg(test)]
 mod job_tests;
 mod knowledge;
+mod ledger;
 mod mapping;
 mod negotiation;
 mod ranking;
@@ -32,9 +33,8 @@ mod view;
 
 use crate::config::{Config, ConfigError};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
-use crate::replica::{AppendError, IngestError, Ingested, Replica, RosterError};
+use crate::replica::{Replica, RosterError};
 use crate::time::Instant;
-use crate::wire::EntryBytes;
 use crate::wire::fact::Fact;
 use allowance::Allowance;
 use condensing::Condensing;
@@ -43,6 +43,7 @@ use gossip::Gossip;
 use io::{Command, Event, Input, JobId, Output, QueryId, Record};
 use job::{Job, JobResult};
 use knowledge::Knowledge;
+use ledger::Ledger;
 use mapping::Mapper;
 use negotiation::Negotiation;
 use rand_chacha::ChaCha8Rng;
@@ -121,7 +122,6 @@ pub struct Agent {
     map: MapState,
     stats: Stats,
     condensing: Condensing,
-    receive_only: bool,
     next_job: u64,
     next_query: u64,
 }
@@ -133,22 +133,6 @@ struct Me {
     key: SigningKey,
     name: Name,
     swarm: Name,
-}
-
-/// Records on their way to the disk.
-#[derive(Default)]
-struct Ledger {
-    open: Vec<Record>,
-    last_batch: u64,
-    waiting: BTreeMap<u64, Batch>,
-}
-
-/// What takes effect once it is durable.
-#[derive(Default)]
-struct Batch {
-    entries: Vec<EntryId>,
-    /// Keypoints of our own. A twin with our key may have told others of them: they wait for our disk all the same.
-    blobs: Vec<(Hash, Vec<u8>)>,
 }
 
 impl Agent {
@@ -189,7 +173,6 @@ impl Agent {
             map: MapState::default(),
             stats: Stats::default(),
             condensing: Condensing::default(),
-            receive_only: false,
             next_job: 1,
             next_query: 1,
         };
@@ -257,14 +240,14 @@ impl Agent {
     /// a new epoch begins. Damage elsewhere is fetched again from neighbours.
     fn restore(&mut self, restored: Restored) {
         let mut entries = Vec::new();
-        let mut private = Vec::new();
+        let (mut private, mut blobs) = (Vec::new(), Vec::new());
         let mut forks = Vec::new();
         let mut closed = None;
         let fresh_epoch = restored.fresh_epoch;
         for record in restored.records {
             match record {
                 Record::Entry { bytes, .. } => entries.push(bytes),
-                Record::Blob { bytes, .. } => self.keep_blob(bytes),
+                Record::Blob { bytes, .. } => blobs.push(bytes),
                 Record::Private { submap, bytes } => private.push((submap, bytes)),
                 Record::Fork { proof, .. } => forks.push(proof),
                 Record::EpochClosed { epoch } => closed = closed.max(Some(epoch)),
@@ -289,145 +272,12 @@ impl Agent {
             self.begin_epoch(closed.saturating_add(1).max(fresh_epoch));
         }
         self.relearn();
+        // Only now it is known which are ours.
+        blobs.into_iter().for_each(|bytes| self.keep_blob(bytes));
         for (submap, bytes) in private {
             self.restore_features(submap, &bytes);
         }
         self.resume_mapping();
-    }
-
-    /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
-    /// here; what was under way waits for the disk with the rest.
-    fn write(&mut self, epoch: u32, fact: &Fact) {
-        match self.replica.append(&self.me.key, epoch, fact) {
-            Ok(entry) => self.ledger.open.push(Record::Entry { id: entry.id(), bytes: entry.encode() }),
-            Err(error) => {
-                self.reject(Some(self.me.robot), "own fact", &error.to_string());
-                if matches!(error, AppendError::NewEpochNeeded(frame, _) if frame == self.me.frame) {
-                    self.begin_epoch(self.me.frame.epoch.saturating_add(1));
-                }
-            }
-        }
-    }
-
-    /// Takes an entry from a peer; it takes effect once it is durable. Whether it changed anything.
-    fn ingest(&mut self, from: Option<RobotId>, bytes: &[u8]) -> bool {
-        match self.replica.ingest(bytes) {
-            Ok(Ingested::New(ids)) => {
-                for id in ids {
-                    let Some(bytes) = self.replica.entry_bytes(id) else { continue };
-                    self.ledger.open.push(Record::Entry { id, bytes: bytes.to_vec() });
-                    if self.replica.is_floor(id) {
-                        self.ledger.open.push(Record::Replaced { below: id, submaps: vec![], blobs: vec![] });
-                    }
-                    self.meet_own_past(id);
-                }
-                return true;
-            }
-            Ok(Ingested::Known | Ingested::Early(_)) => {}
-            Err(error @ IngestError::Fork(frame)) => {
-                self.reject(Some(frame.robot), error.reason(), &error.to_string());
-                self.keep_proof(frame);
-                self.relearn();
-                return true;
-            }
-            Err(error) => self.reject(from, error.reason(), &error.to_string()),
-        }
-        false
-    }
-
-    /// Takes the proof that a log has two histories. Whether it was news.
-    fn ingest_fork(&mut self, from: RobotId, [a, b]: &[EntryBytes; 2]) -> bool {
-        match self.replica.ingest_fork(&a.0, &b.0) {
-            Ok((frame, true)) => {
-                self.reject(Some(frame.robot), "fork", &format!("log {frame} has two histories; it is quarantined"));
-                self.keep_proof(frame);
-                self.relearn();
-                return true;
-            }
-            Ok((_, false)) => {}
-            Err(error) => self.reject(Some(from), error.reason(), &error.to_string()),
-        }
-        false
-    }
-
-    /// A log that is in quarantine stays there over restarts.
-    fn keep_proof(&mut self, frame: FrameId) {
-        self.gossip.spread.on_news(self.now, 1);
-        let proof = self.replica.forks().find(|(forked, _)| *forked == frame);
-        let proof = proof.map(|(_, proof)| [proof.a.clone(), proof.b.clone()]);
-        self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
-    }
-
-    /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide, and
-    /// no later run may take this log for one to go on with: what we hold of it may be less than others do.
-    fn meet_own_past(&mut self, id: EntryId) {
-        let FrameId { robot, epoch } = id.frame;
-        if robot != self.me.robot {
-            return;
-        }
-        if epoch >= self.me.frame.epoch {
-            self.begin_epoch(epoch.saturating_add(1));
-        } else {
-            self.ledger.open.push(Record::EpochClosed { epoch });
-        }
-    }
-
-    /// A new local frame begins: the trajectory so far is closed, for later runs as well, even if this one ends before
-    /// the new epoch has an entry.
-    fn begin_epoch(&mut self, epoch: u32) {
-        self.close_submap();
-        self.me.frame.epoch = epoch;
-        self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
-        self.mapper.restart(&self.config.submap);
-        self.event(Event::EpochBegan { frame: self.me.frame });
-    }
-
-    fn close_batch(&mut self) {
-        if self.ledger.open.is_empty() {
-            return;
-        }
-        let records = core::mem::take(&mut self.ledger.open);
-        self.ledger.last_batch += 1;
-        let mut batch = Batch::default();
-        for record in &records {
-            match record {
-                Record::Entry { id, .. } => batch.entries.push(*id),
-                Record::Blob { hash, bytes } => batch.blobs.push((*hash, bytes.clone())),
-                _ => {}
-            }
-        }
-        self.ledger.waiting.insert(self.ledger.last_batch, batch);
-        self.outputs.push_back(Output::Persist { batch: self.ledger.last_batch, records });
-    }
-
-    fn on_persisted(&mut self, up_to: u64) {
-        let later = self.ledger.waiting.split_off(&up_to.saturating_add(1));
-        let durable = core::mem::replace(&mut self.ledger.waiting, later);
-        if core::mem::take(&mut self.receive_only) {
-            self.negotiation.stir();
-            self.event(Event::StoreHealed);
-        }
-        let mut own = Vec::new();
-        let mut entries = Vec::new();
-        for batch in durable.into_values() {
-            entries.extend(batch.entries);
-            batch.blobs.into_iter().for_each(|(hash, bytes)| self.gossip.add_blob(hash, bytes));
-        }
-        self.gossip.spread.on_news(self.now, entries.len());
-        for id in entries {
-            self.replica.mark_durable(id);
-            self.learn(id);
-            if id.frame.robot == self.me.robot {
-                own.push(id);
-            }
-        }
-        self.publish_entries(&own);
-    }
-
-    fn on_persist_failed(&mut self, reason: String) {
-        if !core::mem::replace(&mut self.receive_only, true) {
-            self.event(Event::ReceiveOnly { reason });
-        }
     }
 
     /// A durable entry takes effect.

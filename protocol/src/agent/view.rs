@@ -49,7 +49,7 @@ impl Agent {
             unsaved: self.unsaved(),
             idle: pending == 0 && settled,
             merged_with: self.merged_with(),
-            receive_only: self.receive_only,
+            receive_only: self.is_receive_only(),
         }
     }
 

@@ -302,8 +302,11 @@ impl Replica {
         Ok(entry)
     }
 
-    /// Whether a log of this frame is or may be held.
-    pub(super) fn check_epoch(&self, frame: FrameId) -> Result<(), IngestError> {
+    /// Whether a log of this frame is or may be held. Nobody has the last epoch of all: none could follow it.
+    pub(crate) fn check_epoch(&self, frame: FrameId) -> Result<(), IngestError> {
+        if frame.epoch == u32::MAX {
+            return Err(IngestError::EpochLimit(frame.robot));
+        }
         let known = self.slots.contains_key(&frame);
         if known || self.epochs_of(frame.robot).count() < self.epochs_per_robot_max {
             return Ok(());

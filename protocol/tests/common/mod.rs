@@ -54,6 +54,11 @@ pub fn agent(k: usize, restored: Restored) -> Agent {
     Agent::new(config(), identity(k), 42 + k as u64, restored, Instant::ZERO).unwrap()
 }
 
+/// A new robot with knobs of its own.
+pub fn agent_of(k: usize, config: &Config) -> Agent {
+    Agent::new(config.clone(), identity(k), 42, Restored::default(), Instant::ZERO).unwrap()
+}
+
 /// Points on the faces of random boxes inside a 16 m hall.
 pub struct World {
     boxes: Vec<(Vector3<f64>, Vector3<f64>, So3)>,

@@ -220,10 +220,11 @@ fn the_future_waits_or_is_carried() {
     let newer = EntryContent { kind: 200, payload: vec![1, 2, 3], ..content(2, 2, 0, Hash::default()) };
     victim.keep(sign(2, newer));
     assert_eq!((victim.0.status().entries, victim.refused("unknown_fact")), (1, 1));
-    // The last epoch there is may begin; more epochs than are held may not.
-    victim.keep(first(2, u32::MAX));
+    // The last epoch but one may begin; the last of all, and more epochs than are held, may not.
+    assert!(!stored(&victim.hear_entry(first(2, u32::MAX))));
+    victim.keep(first(2, u32::MAX - 1));
     assert!(!stored(&victim.hear_entry(first(2, 9))));
-    assert_eq!(victim.refused("epoch_limit"), 1);
+    assert_eq!(victim.refused("epoch_limit"), 2);
 }
 
 #[test]

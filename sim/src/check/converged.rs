@@ -1,6 +1,6 @@
 //! When faults stop, all converge in the stated time (DESIGN §8.6): at the end of a run every robot that is running
 //! holds the same digest. A swarm that is still at work then writes on, and its last facts may be on their way: what any
-//! robot held a stated time before, all must hold, and equal logs must have equal digests.
+//! robot held a stated time before, all must hold, and equal logs must have equal digests. Nobody is excused by being down.
 
 use super::{Check, Phase, RobotSample, Sample};
 use core::time::Duration;
@@ -44,6 +44,9 @@ impl Check for Converged {
             }
         }
         let digests: BTreeSet<_> = robots.iter().map(|robot| robot.digest).collect();
+        if sample.phase == Phase::End && !sample.down.is_empty() {
+            return Err(format!("never came back: {}", sample.down.join(", ")));
+        }
         if sample.phase != Phase::End || digests.len() <= 1 {
             return Ok(());
         }
@@ -116,6 +119,15 @@ mod tests {
         assert!(Converged::default().sample(&Sample { phase: Phase::Calm, ..end }).is_ok());
         let end = sample(vec![robot("alpha", 1, &[]), robot("beta", 1, &[])], &truth, &expect);
         assert!(Converged::default().sample(&end).is_ok());
+    }
+
+    #[test]
+    fn who_is_down_may_be_until_the_end() {
+        let (truth, expect) = (BTreeMap::new(), Expect::default());
+        let alone = sample(vec![robot("alpha", 1, &[])], &truth, &expect);
+        let end = Sample { down: vec!["beta".into()], ..alone };
+        assert!(Converged::default().sample(&Sample { phase: Phase::Calm, ..end.clone() }).is_ok());
+        assert!(Converged::default().sample(&end).is_err_and(|why| why.contains("beta")));
     }
 
     /// Whether it bites when alpha held so much of a log for so many seconds, more at the end, and beta this.

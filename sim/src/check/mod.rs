@@ -94,6 +94,8 @@ pub struct Sample<'a> {
     pub phase: Phase,
     /// Every robot that is running.
     pub robots: Vec<RobotSample>,
+    /// The others, but for those that have left for good.
+    pub down: Vec<String>,
     /// `t_world_frame` of every frame, by `name/epoch`.
     pub truth: &'a BTreeMap<String, Se3>,
     /// What the scenario asks for.
@@ -234,6 +236,6 @@ pub(crate) mod tests {
 
     /// A last sample of these robots.
     pub fn sample<'a>(robots: Vec<RobotSample>, truth: &'a BTreeMap<String, Se3>, expect: &'a Expect) -> Sample<'a> {
-        Sample { at: Instant::ZERO, phase: Phase::End, robots, truth, expect }
+        Sample { at: Instant::ZERO, phase: Phase::End, robots, down: Vec::new(), truth, expect }
     }
 }

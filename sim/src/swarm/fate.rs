@@ -51,7 +51,7 @@ impl<C: Core> Swarm<C> {
             .map_err(|error| SwarmError::Start(robot.name.to_string(), error))?;
         robot.core = Some(core);
         self.trace.note(now, index, "boot");
-        if report.damaged_count > 0 {
+        if report.damaged_count > 0 && self.robots[index].suspect {
             self.see(index, &Seen::Damaged);
         }
         let id = self.robots[index].id;
@@ -138,6 +138,7 @@ impl<C: Core> Swarm<C> {
                     (faults.errors_after, faults.errors, faults.seed) = (after, *errors, seed);
                 };
                 self.robots[robot].store.disk().with_faults(change);
+                self.robots[robot].suspect = true;
             }
             Fault::Pause { lasts, .. } => {
                 self.robots[robot].paused_until = now.after(millis(1e3 * lasts));
@@ -249,6 +250,7 @@ impl<C: Core> Swarm<C> {
 
     fn lost_what_it_confirmed(&mut self, robot: usize) {
         self.doubt(robot);
+        self.robots[robot].suspect = true;
         self.see(robot, &Seen::Damaged);
     }
 
@@ -256,7 +258,7 @@ impl<C: Core> Swarm<C> {
         let Some(twin) = self.robots.iter().position(|robot| robot.twin == Some(fault)) else { return };
         let image = self.robots[of].store.picture();
         self.robots[twin].store.restore(&image);
-        self.robots[twin].gone = false;
+        (self.robots[twin].gone, self.robots[twin].suspect) = (false, self.robots[of].suspect);
         self.counts.twins += 1;
         self.doubt(of);
         let id = self.robots[of].id;

@@ -68,7 +68,8 @@ impl<C: Core> Swarm<C> {
         let done = self.healed && all_done(&robots);
         self.done_samples = if done { self.done_samples + 1 } else { 0 };
         let phase = if self.healed { Phase::Calm } else { Phase::Storm };
-        let sample = Sample { at: now, phase, robots, truth: &self.truth, expect: &self.scenario.expect };
+        let (down, expect) = (self.down(), &self.scenario.expect);
+        let sample = Sample { at: now, phase, robots, down, truth: &self.truth, expect };
         let (checks, stopwatch) = (&mut self.checks, &mut self.stopwatch);
         if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {
             self.violation.get_or_insert(violation);
@@ -76,6 +77,11 @@ impl<C: Core> Swarm<C> {
         // A snapshot costs more the more robots there are, and there are as many of them.
         let pause = (0.2 * self.robots.len() as f64).clamp(1.0, SAMPLE_SECS_MAX);
         self.queue.push(now.after(millis(1e3 * pause)), Event::Sample);
+    }
+
+    /// Robots that should run and do not.
+    pub(super) fn down(&self) -> Vec<String> {
+        self.robots.iter().filter(|robot| robot.core.is_none() && !robot.gone).map(Robot::label).collect()
     }
 
     pub(super) fn robot_samples(&mut self, now: Instant) -> Vec<RobotSample> {

@@ -252,6 +252,7 @@ impl<C: Core> Swarm<C> {
                 at: ended,
                 phase: Phase::End,
                 robots: robots.clone(),
+                down: self.down(),
                 truth: &self.truth,
                 expect: &self.scenario.expect,
             };

@@ -39,6 +39,8 @@ pub(super) struct Robot<C> {
     pub paused_until: Instant,
     pub gone: bool,
     pub store: Store,
+    /// A fault befell it that explains damage: what its store reports excuses it only then.
+    pub suspect: bool,
     /// The disk as it was at some time.
     pub image: Option<Picture>,
     /// The fault that makes this robot another's twin.
@@ -110,6 +112,7 @@ impl<C> Robot<C> {
             wake: None,
             paused_until: Instant::ZERO,
             gone: false,
+            suspect: false,
             store: Store::new(owner),
             image: None,
             twin: None,

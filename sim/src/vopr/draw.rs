@@ -107,7 +107,7 @@ fn network(dice: &mut Dice) -> NetworkOptions {
         reorder: sometimes(0.3, 0.0, 0.5),
         reorder_ms_max: 50.0 + sometimes(0.5, 0.0, 5000.0),
         mangle: sometimes(0.3, 0.0, 0.2),
-        replay: sometimes(0.3, 0.0, 0.1),
+        replay: sometimes(0.3, 0.0, 0.5),
         bytes_per_sec: sometimes(0.2, 3_000.0, 60_000.0),
         queue_ms_max: 100.0 + sometimes(0.5, 0.0, 3000.0),
         answer_ms_max: 500.0 + sometimes(0.7, 0.0, 4000.0),
@@ -355,7 +355,7 @@ impl Faults<'_> {
         }
         if self.happens(0.1) {
             let ((at, lasts), robot) = (self.when(1.0, 10.0), self.robot());
-            let per_sec = libm::pow(10.0, self.dice.range(1.0, 3.3));
+            let per_sec = libm::pow(10.0, self.dice.range(1.0, 4.0));
             self.faults.push(Fault::Flood { at, lasts, robot, per_sec });
         }
     }

@@ -1,0 +1,194 @@
+//! What this robot keeps: facts of its own and of others on their way to the disk, where they take effect, and the epochs
+//! that its own are written in. While it cannot write, it is receive-only.
+
+use super::Agent;
+use super::io::{Event, Output, Record};
+use crate::ids::{EntryId, FrameId, Hash, RobotId};
+use crate::replica::{AppendError, IngestError, Ingested};
+use crate::wire::EntryBytes;
+use crate::wire::fact::Fact;
+use std::collections::BTreeMap;
+
+/// Batches on their way to the disk beyond which facts of others and sightings are refused: the disk is too slow for them.
+/// What must be kept is bounded by itself: submaps by their queue, answers by their list.
+pub const BATCHES_WAITING_MAX: usize = 1_024;
+
+/// Records on their way to the disk.
+#[derive(Default)]
+pub(super) struct Ledger {
+    /// Of this call; they leave together at its end.
+    pub(super) open: Vec<Record>,
+    last_batch: u64,
+    pub(super) waiting: BTreeMap<u64, Batch>,
+    /// The disk refused, and has not taken anything since.
+    pub(super) fails: bool,
+}
+
+/// What takes effect once it is durable.
+#[derive(Default)]
+pub(super) struct Batch {
+    entries: Vec<EntryId>,
+    /// Keypoints of our own. A twin with our key may have told others of them: they wait for our disk all the same.
+    blobs: Vec<(Hash, Vec<u8>)>,
+}
+
+impl Agent {
+    /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
+    /// here; what was under way waits for the disk with the rest.
+    pub(super) fn write(&mut self, epoch: u32, fact: &Fact) {
+        match self.replica.append(&self.me.key, epoch, fact) {
+            Ok(entry) => self.ledger.open.push(Record::Entry { id: entry.id(), bytes: entry.encode() }),
+            Err(error) => {
+                self.reject(Some(self.me.robot), "own fact", &error.to_string());
+                if matches!(error, AppendError::NewEpochNeeded(frame, _) if frame == self.me.frame) {
+                    self.begin_epoch(self.me.frame.epoch.saturating_add(1));
+                }
+            }
+        }
+    }
+
+    /// Takes an entry from a peer; it takes effect once it is durable. Whether it changed anything.
+    pub(super) fn ingest(&mut self, from: Option<RobotId>, bytes: &[u8]) -> bool {
+        match self.replica.ingest(bytes) {
+            Ok(Ingested::New(ids)) => {
+                for id in ids {
+                    let Some(bytes) = self.replica.entry_bytes(id) else { continue };
+                    self.ledger.open.push(Record::Entry { id, bytes: bytes.to_vec() });
+                    if self.replica.is_floor(id) {
+                        self.ledger.open.push(Record::Replaced { below: id, submaps: vec![], blobs: vec![] });
+                    }
+                    self.meet_own_past(id);
+                }
+                return true;
+            }
+            // We signed it: there is more of this past, and what we wrote before it comes would be refused.
+            Ok(Ingested::Early(id)) if id.frame.robot == self.me.robot && id.frame.epoch >= self.me.frame.epoch => {
+                self.meet_own_past(id);
+            }
+            Ok(Ingested::Known | Ingested::Early(_)) => {}
+            Err(error @ IngestError::Fork(frame)) => {
+                self.reject(Some(frame.robot), error.reason(), &error.to_string());
+                self.keep_proof(frame);
+                self.relearn();
+                return true;
+            }
+            Err(error) => self.reject(from, error.reason(), &error.to_string()),
+        }
+        false
+    }
+
+    /// Takes the proof that a log has two histories. Whether it was news.
+    pub(super) fn ingest_fork(&mut self, from: RobotId, [a, b]: &[EntryBytes; 2]) -> bool {
+        match self.replica.ingest_fork(&a.0, &b.0) {
+            Ok((frame, true)) => {
+                self.reject(Some(frame.robot), "fork", &format!("log {frame} has two histories; it is quarantined"));
+                self.keep_proof(frame);
+                self.relearn();
+                return true;
+            }
+            Ok((_, false)) => {}
+            Err(error) => self.reject(Some(from), error.reason(), &error.to_string()),
+        }
+        false
+    }
+
+    /// A log that is in quarantine stays there over restarts.
+    fn keep_proof(&mut self, frame: FrameId) {
+        self.gossip.spread.on_news(self.now, 1);
+        let proof = self.replica.forks().find(|(forked, _)| *forked == frame);
+        let proof = proof.map(|(_, proof)| [proof.a.clone(), proof.b.clone()]);
+        self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
+    }
+
+    /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide, and
+    /// no later run may take this log for one to go on with: what we hold of it may be less than others do.
+    fn meet_own_past(&mut self, id: EntryId) {
+        let FrameId { robot, epoch } = id.frame;
+        if robot != self.me.robot {
+            return;
+        }
+        if epoch >= self.me.frame.epoch {
+            self.begin_epoch(epoch.saturating_add(1));
+        } else {
+            self.ledger.open.push(Record::EpochClosed { epoch });
+        }
+    }
+
+    /// A new local frame begins: the trajectory so far is closed, for later runs as well, even if this one ends before
+    /// the new epoch has an entry.
+    pub(super) fn begin_epoch(&mut self, epoch: u32) {
+        self.close_submap();
+        self.me.frame.epoch = epoch;
+        self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
+        self.mapper.restart(&self.config.submap);
+        self.event(Event::EpochBegan { frame: self.me.frame });
+        if let Some(error) = self.epoch_limit() {
+            self.event(Event::ReceiveOnly { reason: error.to_string() });
+        }
+    }
+
+    /// No more may wait for the disk than already does.
+    pub(super) fn is_overloaded(&self) -> bool {
+        self.ledger.waiting.len() >= BATCHES_WAITING_MAX
+    }
+
+    /// Nothing of our own can be written now. What others write is heard, kept if the disk takes it, and served.
+    pub(super) fn is_receive_only(&self) -> bool {
+        self.ledger.fails || self.epoch_limit().is_some()
+    }
+
+    /// Why nobody would take a fact of our epoch.
+    pub(super) fn epoch_limit(&self) -> Option<AppendError> {
+        self.replica.check_epoch(self.me.frame).err().map(|_| AppendError::EpochLimit(self.me.robot))
+    }
+
+    pub(super) fn close_batch(&mut self) {
+        if self.ledger.open.is_empty() {
+            return;
+        }
+        let records = core::mem::take(&mut self.ledger.open);
+        self.ledger.last_batch += 1;
+        let mut batch = Batch::default();
+        for record in &records {
+            match record {
+                Record::Entry { id, .. } => batch.entries.push(*id),
+                Record::Blob { hash, bytes } => batch.blobs.push((*hash, bytes.clone())),
+                _ => {}
+            }
+        }
+        self.ledger.waiting.insert(self.ledger.last_batch, batch);
+        self.outputs.push_back(Output::Persist { batch: self.ledger.last_batch, records });
+    }
+
+    pub(super) fn on_persisted(&mut self, up_to: u64) {
+        let later = self.ledger.waiting.split_off(&up_to.saturating_add(1));
+        let durable = core::mem::replace(&mut self.ledger.waiting, later);
+        if core::mem::take(&mut self.ledger.fails) {
+            self.negotiation.stir();
+            self.event(Event::StoreHealed);
+        }
+        let mut own = Vec::new();
+        let mut entries = Vec::new();
+        for batch in durable.into_values() {
+            entries.extend(batch.entries);
+            for (hash, bytes) in batch.blobs {
+                self.gossip.add_blob(hash, bytes, || self.knowledge.blobs_of(self.me.robot));
+            }
+        }
+        self.gossip.spread.on_news(self.now, entries.len());
+        for id in entries {
+            self.replica.mark_durable(id);
+            self.learn(id);
+            if id.frame.robot == self.me.robot {
+                own.push(id);
+            }
+        }
+        self.publish_entries(&own);
+    }
+
+    pub(super) fn on_persist_failed(&mut self, reason: String) {
+        if !core::mem::replace(&mut self.ledger.fails, true) {
+            self.event(Event::ReceiveOnly { reason: format!("the store fails: {reason}") });
+        }
+    }
+}
