@@ -327,6 +327,10 @@ pub struct FaultCounts {
     pub writes_torn: u64,
     /// Commits that the disk refused.
     pub disk_refused: u64,
+    /// Writes and syncs that it refused for want of room.
+    pub writes_without_room: u64,
+    /// Writes and syncs that failed.
+    pub writes_failed: u64,
     /// Commits that it took after it had refused.
     pub disk_healed: u64,
     /// Syncs that lied.

@@ -95,6 +95,13 @@ mod tests {
         assert!(verdict(disk(DISK_BYTES_MAX)).is_ok() && verdict(disk(DISK_BYTES_MAX + 1)).is_err());
         let unsaved = |count| move |one: &mut RobotSample| one.snapshot.as_mut().unwrap().status.unsaved = count;
         assert!(verdict(unsaved(UNSAVED_MAX)).is_ok() && verdict(unsaved(UNSAVED_MAX + 1)).is_err());
+        let rows = |count: usize| {
+            move |one: &mut RobotSample| {
+                let rejected = &mut one.snapshot.as_mut().unwrap().stats.rejected;
+                rejected.extend((0..count).map(|k| (format!("reason {k}"), 1)));
+            }
+        };
+        assert!(verdict(rows(STATS_ROWS_MAX)).is_ok() && verdict(rows(STATS_ROWS_MAX + 1)).is_err());
         let stranger = |one: &mut RobotSample| {
             one.logs.insert(FrameId { robot: RobotId([2; 8]), epoch: 0 }, Some(1));
         };

@@ -87,7 +87,9 @@ impl Check for Floors {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use merganser_protocol::ids::{EntryId, RobotId};
+    use merganser_protocol::agent::io::{AskToken, Channel};
+    use merganser_protocol::ids::{EntryId, Hash, Name, RobotId};
+    use merganser_protocol::wire::{Delta, EntryBytes, EntryContent, SwarmTag};
 
     const FRAME: FrameId = FrameId { robot: RobotId([1; 8]), epoch: 4 };
 
@@ -116,6 +118,27 @@ mod tests {
         assert!(hand_over(&mut check, 0, entry(4)).is_err(), "no more after a restart");
         check.see(0, &Seen::Wiped).unwrap();
         assert!(hand_over(&mut check, 0, entry(4)).is_ok());
+    }
+
+    #[test]
+    fn what_is_offered_from_below_is_seen_whichever_way() {
+        let mut check = Floors::default();
+        hand_over(&mut check, 0, floor(5)).unwrap();
+        check.see(0, &Seen::Durable(1)).unwrap();
+        let key = ed25519_dalek::SigningKey::from_bytes(&[1; 32]);
+        let signed = |seq| {
+            let (id, swarm) = (EntryId { frame: FRAME, seq }, SwarmTag::of(&Name::new("test").unwrap()));
+            let content = EntryContent { swarm, id, kind: 200, floor: 0, previous: Hash([1; 32]), payload: vec![1] };
+            EntryBytes(Entry::sign(&key, content).unwrap().encode())
+        };
+        let mut says = |seq| {
+            let published =
+                Output::Publish { channel: Channel::Facts, bytes: Message::Facts(vec![signed(seq)]).encode() };
+            let delta = Delta { entries: vec![signed(seq)], ..Delta::default() };
+            let answer = Output::Answer { token: AskToken(1), bytes: Message::SyncReply(delta).encode() };
+            [published, answer].map(|output| check.see(0, &Seen::Output(&output)).is_ok())
+        };
+        assert_eq!((says(5), says(4)), ([true; 2], [false; 2]));
     }
 
     #[test]

@@ -60,6 +60,19 @@ mod tests {
     }
 
     #[test]
+    fn a_false_scale_is_a_false_merge() {
+        let truth = BTreeMap::from(["alpha/1", "beta/1"].map(|frame| (frame.to_owned(), Se3::identity())));
+        let expect = Expect { error_max_m: 0.5, error_max_deg: 5.0, ..Expect::default() };
+        let verdict = |scale: f64| {
+            let mut relation = relation(Se3::identity(), 1.0);
+            relation.pose.scale = scale;
+            NoFalseMerge.sample(&sample(vec![robot("alpha", 1, &[("beta/1", relation)])], &truth, &expect))
+        };
+        assert!(verdict(1.049).is_ok() && verdict(0.951).is_ok());
+        assert!(verdict(1.051).is_err() && verdict(0.949).is_err() && verdict(f64::NAN).is_err());
+    }
+
+    #[test]
     fn a_liar_may_deceive_itself_of_itself_alone() {
         let truth = BTreeMap::from(["alpha/1", "alpha/2", "beta/1"].map(|frame| (frame.to_owned(), Se3::identity())));
         let expect = Expect { error_max_m: 0.5, error_max_deg: 5.0, ..Expect::default() };

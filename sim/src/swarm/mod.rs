@@ -246,6 +246,12 @@ impl<C: Core> Swarm<C> {
         let robots = self.robot_samples(ended);
         self.pin_frames(&robots);
         let snapshots = robots.iter().filter_map(|robot| robot.snapshot.as_ref());
+        for robot in &self.robots {
+            let (no_room, failed) =
+                robot.store.disk().with_faults(|faults| (faults.refused_full, faults.refused_error));
+            self.counts.writes_without_room += no_room;
+            self.counts.writes_failed += failed;
+        }
         self.counts.held_back = snapshots.flat_map(|snapshot| snapshot.stats.held_back.values()).sum();
         if self.violation.is_none() {
             let sample = Sample {

@@ -122,10 +122,12 @@ fn run_band(band: Band, args: &VoprArgs) -> anyhow::Result<BTreeMap<u64, SeedRep
 fn broken_text(report: &SeedReport, args: &VoprArgs) -> Option<String> {
     let Violation { invariant, at_secs, what } = report.violation.as_ref()?;
     let robots = args.robots.map_or_else(String::new, |robots| format!(" --robots {robots}"));
+    // A seed alone is run once, unless it is said.
+    let twice = if args.twice || report.seed.is_multiple_of(TWICE_EVERY) { " --twice" } else { "" };
     let seed = report.seed;
     Some(format!(
         "BROKEN   seed {seed}, at {at_secs:.3} s: {invariant}\n         {what}\nREPLAY   merganser-sim vopr --seed \
-         {seed}{robots}"
+         {seed}{robots}{twice}"
     ))
 }
 
