@@ -38,6 +38,8 @@ pub trait Core: Send + 'static {
     fn digest(&self) -> Hash;
     /// See [`Agent::status`].
     fn status(&self) -> StatusView;
+    /// See [`Agent::store_fails`].
+    fn store_fails(&self) -> bool;
     /// What the core believes now.
     fn snapshot(&self, now: Instant) -> Snapshot;
     /// See [`Agent::overview`].
@@ -61,6 +63,9 @@ impl Core for Agent {
     }
     fn status(&self) -> StatusView {
         Self::status(self)
+    }
+    fn store_fails(&self) -> bool {
+        Self::store_fails(self)
     }
     fn snapshot(&self, now: Instant) -> Snapshot {
         Self::snapshot(self, now)
@@ -236,8 +241,7 @@ impl<C: Core, N: Network> Driver<C, N> {
     }
 
     fn unsaved(&self) -> bool {
-        let status = self.parts.core.status();
-        status.unsaved > 0 && !status.receive_only
+        self.parts.core.status().unsaved > 0 && !self.parts.core.store_fails()
     }
 
     /// When to send [`Input::Timeout`]. Right after one, not at once: inputs must have their turn.

@@ -12,7 +12,7 @@ use merganser::keys;
 use merganser::link::session::{self, Role};
 use merganser::observation::KeyframeMessage;
 use merganser::store;
-use merganser_protocol::agent::io::{Channel, Input, Output, QueryId, QueryKind};
+use merganser_protocol::agent::io::{Channel, Command, Input, Output, QueryId, QueryKind, Record};
 use merganser_protocol::ids::RobotId;
 use merganser_protocol::snapshot::StatusView;
 use std::collections::BTreeMap;
@@ -201,4 +201,33 @@ async fn views_are_published_as_json_while_somebody_subscribes() {
     drop(samples);
     session::close(&session, PATIENCE).await;
     alpha.stop().await.unwrap();
+}
+
+/// Found in review: at its last epoch an agent is receive-only, but what it has of the epoch before can still be written.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_at_its_last_epoch_still_saves_what_it_drove_before_it_ends() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut configs = swarm(dir.path(), &["alpha"]);
+    configs[0].core.gossip.epochs_per_robot_max = 1;
+    let entries = |config: &FileConfig| {
+        let records = store::open(config).unwrap().restored.records;
+        records.iter().filter(|record| matches!(record, Record::Entry { .. })).count()
+    };
+    // The first submap takes its epoch; the second is open when both that and the agent end.
+    for wanted in 1..=2 {
+        let alpha = start(&configs[0], None).await;
+        for index in 0..4 {
+            alpha.inbox().deliver(Input::Keyframe(keyframe(0, 4 * wanted + index)));
+        }
+        if wanted == 2 {
+            alpha.inbox().deliver(Input::Command(Command::NewEpoch));
+            // At once: the submap is still being described then.
+            let told = async || while !alpha.snapshots().overview().await.unwrap().status.receive_only {};
+            tokio::time::timeout(PATIENCE, told()).await.unwrap();
+        } else {
+            until("keyframes", async || alpha.snapshots().overview().await.unwrap().status.keyframes == 4).await;
+        }
+        alpha.stop().await.unwrap();
+        assert_eq!(entries(&configs[0]) as u64, wanted);
+    }
 }

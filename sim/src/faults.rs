@@ -100,6 +100,9 @@ pub enum Fault {
         robot: String,
         /// How many.
         errors: u64,
+        /// Reads fail, too.
+        #[serde(default)]
+        reads: bool,
     },
     /// The disk says that it synced, and does not; at the end the power goes.
     LyingDisk {
@@ -331,6 +334,8 @@ pub struct FaultCounts {
     pub writes_without_room: u64,
     /// Writes and syncs that failed.
     pub writes_failed: u64,
+    /// Reads of the disk that failed.
+    pub reads_failed: u64,
     /// Commits that it took after it had refused.
     pub disk_healed: u64,
     /// Syncs that lied.

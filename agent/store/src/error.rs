@@ -51,7 +51,11 @@ pub enum StoreError {
         reason: String,
     },
     /// The disk failed.
-    #[error("store {path}: {reason}", path = path.display())]
+    #[error(
+        "store {path}: the disk fails ({reason}), and nothing was changed; mend or replace it, or move the file to one that \
+         works; without the file, an empty store begins a new epoch and fetches the swarm's facts again",
+        path = path.display()
+    )]
     Failed {
         /// Where.
         path: PathBuf,

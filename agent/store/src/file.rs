@@ -49,8 +49,9 @@ impl Medium for FileMedium {
             let kept = self.beside(".damaged");
             match fs::remove_file(&kept) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-                // Where there are no links (FAT), a copy does.
-                _ => fs::hard_link(&self.path, &kept).or_else(|_| fs::copy(&self.path, &kept).map(drop))?,
+                // Where there are no links (FAT), a copy does; half a one only takes room.
+                _ => fs::hard_link(&self.path, &kept)
+                    .or_else(|_| fs::copy(&self.path, &kept).map(drop).inspect_err(|_| drop(fs::remove_file(&kept))))?,
             }
         }
         // One step: a crash leaves the one or the other at the path, never neither.

@@ -6,9 +6,8 @@ use crate::{SCHEMA, StoreError, mend};
 use merganser_protocol::agent::io::Record;
 use merganser_protocol::ids::{EntryId, Hash, SubmapId};
 use merganser_protocol::wire::Entry;
-use redb::{
-    Database, DatabaseError, ReadableDatabase, ReadableTable, ReadableTableMetadata, TableDefinition, TableError,
-};
+use redb::{Database, ReadableDatabase, ReadableTable, ReadableTableMetadata, TableDefinition, TableError};
+use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Damaged records listed one by one; the rest is counted.
@@ -55,6 +54,8 @@ pub struct Inspection {
     pub damaged_count: usize,
     /// An entry may be missing.
     pub entries_lost: bool,
+    /// What the disk said where it gave nothing.
+    unreadable: Option<String>,
 }
 
 /// Reads the whole store and changes nothing but what a crash left unfinished.
@@ -80,9 +81,10 @@ pub(crate) fn read(db: &mut Database) -> Result<Inspection, String> {
         damaged: Vec::new(),
         damaged_count: 0,
         entries_lost: false,
+        unreadable: None,
     };
-    if let Some(why) = check_pages(db)? {
-        seen.add("pages", "the file".into(), why);
+    if let Err(trouble) = check_pages(db) {
+        seen.meet("pages", "the file".into(), trouble);
     }
     seen.read_meta(db);
     match seen.schema {
@@ -96,23 +98,49 @@ pub(crate) fn read(db: &mut Database) -> Result<Inspection, String> {
             }
         }
     }
-    Ok(seen)
+    // What the disk did not give now it may give later: it must not be taken for lost, and dropped.
+    seen.unreadable.take().map_or(Ok(seen), Err)
 }
 
-/// The database's own checksums, over all pages: what is wrong, if anything.
-fn check_pages(db: &mut Database) -> Result<Option<String>, String> {
-    match catch_unwind(AssertUnwindSafe(|| db.check_integrity())) {
-        Ok(Ok(_)) => Ok(None), // `false`: a crash left something unfinished that is now done
-        Ok(Err(DatabaseError::Storage(redb::StorageError::Io(error)))) => Err(error.to_string()),
-        Ok(Err(error)) => Ok(Some(error.to_string())),
-        Err(panic) => Ok(Some(tables::what_panicked(&*panic))),
+/// Why something was not read.
+enum Trouble {
+    /// The disk does not give it.
+    Unreadable(String),
+    /// It is not what was written.
+    Damaged(String),
+}
+
+fn attempt<T>(work: impl FnOnce() -> Result<T, redb::Error>) -> Result<T, Trouble> {
+    match catch_unwind(AssertUnwindSafe(work)) {
+        Ok(Ok(value)) => Ok(value),
+        // These two say that the file is shorter than, or not what, it should be.
+        Ok(Err(redb::Error::Io(error)))
+            if !matches!(error.kind(), io::ErrorKind::UnexpectedEof | io::ErrorKind::InvalidData) =>
+        {
+            Err(Trouble::Unreadable(error.to_string()))
+        }
+        Ok(Err(error)) => Err(Trouble::Damaged(error.to_string())),
+        Err(panic) => Err(Trouble::Damaged(tables::what_panicked(&*panic))),
     }
+}
+
+/// The database's own checksums, over all pages.
+fn check_pages(db: &mut Database) -> Result<(), Trouble> {
+    // `false`: a crash left something unfinished that is now done.
+    attempt(|| Ok(db.check_integrity().map(drop)?))
 }
 
 impl Inspection {
     /// Whether all is well.
     pub fn is_sound(&self) -> bool {
         self.damaged_count == 0
+    }
+
+    fn meet(&mut self, table: &'static str, what: String, trouble: Trouble) {
+        match trouble {
+            Trouble::Damaged(why) => self.add(table, what, why),
+            Trouble::Unreadable(why) => self.unreadable = self.unreadable.take().or(Some(why)),
+        }
     }
 
     fn add(&mut self, table: &'static str, what: String, why: String) {
@@ -124,17 +152,20 @@ impl Inspection {
     }
 
     fn read_meta(&mut self, db: &Database) {
-        let (schema, trouble) = meta(db, tables::META_SCHEMA);
-        let numbered = schema.as_deref().and_then(number);
-        self.schema = match (schema, numbered) {
-            (_, Some(version)) => Schema::Version(version),
-            (Some(_), None) => Schema::Unknown("of unknown form".into()),
+        let missing = || Trouble::Damaged("is missing".into());
+        let (schema, trouble) = match meta(db, tables::META_SCHEMA) {
+            Ok(Some(schema)) => match number(&schema) {
+                Some(version) => (Schema::Version(version), None),
+                None => (Schema::Unknown("of unknown form".into()), None),
+            },
             // No number, but tables: what is sealed says by itself which schema it has.
-            (None, None) if trouble.is_some() || has_tables(db) => Schema::Version(SCHEMA),
-            (None, None) => Schema::New,
+            Ok(None) if has_tables(db) => (Schema::Version(SCHEMA), Some(missing())),
+            Ok(None) => (Schema::New, None),
+            Err(trouble) => (Schema::Version(SCHEMA), Some(trouble)),
         };
-        if numbered.is_none() && self.schema == Schema::Version(SCHEMA) {
-            self.add("meta", "schema".into(), trouble.unwrap_or_else(|| "is missing".into()));
+        self.schema = schema;
+        if let Some(trouble) = trouble {
+            self.meet("meta", "schema".into(), trouble);
         }
         let Schema::Version(version) = self.schema else { return };
         self.owner = self.sealed_meta(db, version, tables::META_OWNER).and_then(|bytes| String::from_utf8(bytes).ok());
@@ -145,8 +176,8 @@ impl Inspection {
     fn sealed_meta(&mut self, db: &Database, version: u32, key: &'static str) -> Option<Vec<u8>> {
         let optional = key == tables::META_CLOSED_EPOCH;
         match meta(db, key) {
-            (Some(value), _) if version < SCHEMA => Some(value),
-            (Some(value), _) => {
+            Ok(Some(value)) if version < SCHEMA => Some(value),
+            Ok(Some(value)) => {
                 let sound = unseal("meta", key.as_bytes(), &value).map(<[u8]>::to_vec);
                 if sound.is_none() {
                     self.add("meta", key.into(), "its seal is broken".into());
@@ -155,9 +186,10 @@ impl Inspection {
                 }
                 sound
             }
-            (None, None) if optional => None,
-            (None, trouble) => {
-                self.add("meta", key.into(), trouble.unwrap_or_else(|| "is missing".into()));
+            Ok(None) if optional => None,
+            missing => {
+                let trouble = missing.err().unwrap_or_else(|| Trouble::Damaged("is missing".into()));
+                self.meet("meta", key.into(), trouble);
                 self.entries_lost |= optional;
                 None
             }
@@ -223,7 +255,8 @@ impl Inspection {
         let mut trouble = walk(db, table, Direction::Forward, |key, value| {
             rows.push((key, value));
             true
-        });
+        })
+        .err();
         if trouble.is_some() {
             let last = rows.last().map(|(key, _)| *key);
             let mut tail = Vec::new();
@@ -236,15 +269,9 @@ impl Inspection {
             }); // the same trouble, met from behind
             rows.extend(tail.into_iter().rev());
         }
-        let len = catch_unwind(AssertUnwindSafe(|| table_len(db, table))).ok().flatten();
-        if trouble.is_none() && len != Some(rows.len() as u64) {
-            trouble = Some(format!("{} rows were found where there should be {len:?}", rows.len()));
-        }
-        if trouble.is_none() && !rows.is_sorted_by(|(a, _), (b, _)| a < b) {
-            trouble = Some("rows are out of order".into());
-        }
-        if let Some(why) = trouble {
-            self.add(name, "a part of the table".into(), why);
+        trouble = trouble.or_else(|| check_rows(db, table, &rows).err());
+        if let Some(trouble) = trouble {
+            self.meet(name, "a part of the table".into(), trouble);
         }
         rows
     }
@@ -256,14 +283,14 @@ enum Direction {
     Backward,
 }
 
-/// Shows rows to `each` until it says no or no more can be read; what the trouble was.
+/// Shows rows to `each` until it says no or no more can be read.
 fn walk<const N: usize>(
     db: &Database,
     table: TableDefinition<'_, [u8; N], &'static [u8]>,
     direction: Direction,
     mut each: impl FnMut([u8; N], Vec<u8>) -> bool,
-) -> Option<String> {
-    let mut all = || -> Result<(), redb::Error> {
+) -> Result<(), Trouble> {
+    attempt(|| {
         let table = db.begin_read()?.open_table(table)?;
         let mut rows = table.iter()?;
         loop {
@@ -271,41 +298,40 @@ fn walk<const N: usize>(
                 Direction::Forward => rows.next(),
                 Direction::Backward => rows.next_back(),
             };
-            let Some((key, value)) = row.transpose()? else { break };
+            let Some((key, value)) = row.transpose()? else { return Ok(()) };
             if !each(key.value(), value.value().to_vec()) {
-                break;
+                return Ok(());
             }
         }
-        Ok(())
-    };
-    match catch_unwind(AssertUnwindSafe(&mut all)) {
-        Ok(Ok(())) => None,
-        Ok(Err(error)) => Some(error.to_string()),
-        Err(panic) => Some(tables::what_panicked(&*panic)),
+    })
+}
+
+/// Whether the rows are as many as the table says, and rise.
+fn check_rows<const N: usize>(
+    db: &Database,
+    table: TableDefinition<'_, [u8; N], &'static [u8]>,
+    rows: &[([u8; N], Vec<u8>)],
+) -> Result<(), Trouble> {
+    let len = attempt(|| Ok(db.begin_read()?.open_table(table)?.len()?))?;
+    if len != rows.len() as u64 {
+        return Err(Trouble::Damaged(format!("{} rows were found where there should be {len}", rows.len())));
     }
-}
-
-fn table_len<const N: usize>(db: &Database, table: TableDefinition<'_, [u8; N], &'static [u8]>) -> Option<u64> {
-    db.begin_read().ok()?.open_table(table).ok()?.len().ok()
-}
-
-/// The stored value, and what kept it from being read.
-fn meta(db: &Database, key: &str) -> (Option<Vec<u8>>, Option<String>) {
-    let get = || -> Result<Option<Vec<u8>>, redb::Error> {
-        match db.begin_read()?.open_table(META) {
-            Ok(table) => Ok(table.get(key)?.map(|value| value.value().to_vec())),
-            Err(TableError::TableDoesNotExist(_)) => Ok(None),
-            Err(error) => Err(error.into()),
-        }
-    };
-    match catch_unwind(AssertUnwindSafe(get)) {
-        Ok(Ok(value)) => (value, None),
-        Ok(Err(error)) => (None, Some(error.to_string())),
-        Err(panic) => (None, Some(tables::what_panicked(&*panic))),
+    if !rows.is_sorted_by(|(a, _), (b, _)| a < b) {
+        return Err(Trouble::Damaged("rows are out of order".into()));
     }
+    Ok(())
 }
 
+/// The stored value.
+fn meta(db: &Database, key: &str) -> Result<Option<Vec<u8>>, Trouble> {
+    attempt(|| match db.begin_read()?.open_table(META) {
+        Ok(table) => Ok(table.get(key)?.map(|value| value.value().to_vec())),
+        Err(TableError::TableDoesNotExist(_)) => Ok(None),
+        Err(error) => Err(error.into()),
+    })
+}
+
+/// Whether there are tables, for all that can be read.
 fn has_tables(db: &Database) -> bool {
-    let count = || db.begin_read().ok()?.list_tables().ok().map(Iterator::count);
-    catch_unwind(AssertUnwindSafe(count)).ok().flatten() != Some(0)
+    attempt(|| Ok(db.begin_read()?.list_tables()?.next().is_some())).unwrap_or(true)
 }

@@ -34,10 +34,13 @@ struct Platter {
 pub struct Faults {
     /// No room: writes and growth fail.
     pub full: bool,
-    /// So many operations from now, and for as many as [`Faults::errors`], writes and syncs fail.
+    /// So many operations from now, and for as many as [`Faults::errors`], writes and syncs fail, and reads if
+    /// [`Faults::reads`].
     pub errors_after: u64,
     /// How many operations will fail.
     pub errors: u64,
+    /// Reads fail with the rest.
+    pub reads: bool,
     /// Syncs say that they did, and do nothing.
     pub lies: bool,
     /// After so many writes and syncs the power is gone: all fail, until [`Disk::cut`].
@@ -48,6 +51,8 @@ pub struct Faults {
     pub refused_full: u64,
     /// Writes and syncs that failed.
     pub refused_error: u64,
+    /// Reads that failed.
+    pub refused_reads: u64,
     /// Syncs that lied.
     pub lied: u64,
     /// The power went in the middle of an operation.
@@ -238,11 +243,26 @@ impl Faults {
             }
             *left -= 1;
         }
+        let fails = self.fails();
+        self.refused_error += u64::from(fails.is_err());
+        fails
+    }
+
+    /// One read: does it fail?
+    fn read(&mut self) -> io::Result<()> {
+        if !self.reads {
+            return Ok(());
+        }
+        let fails = self.fails();
+        self.refused_reads += u64::from(fails.is_err());
+        fails
+    }
+
+    fn fails(&mut self) -> io::Result<()> {
         if self.errors_after > 0 {
             self.errors_after -= 1;
         } else if self.errors > 0 {
             self.errors -= 1;
-            self.refused_error += 1;
             return Err(io::Error::other("input/output error"));
         }
         Ok(())
@@ -275,6 +295,7 @@ impl StorageBackend for Handle {
     }
 
     fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        lock(&self.faults).read()?;
         let image = lock(&self.image);
         let start = usize::try_from(offset).map_err(io::Error::other)?;
         let end = start.checked_add(out.len()).ok_or(io::ErrorKind::InvalidInput)?;

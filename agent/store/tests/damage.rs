@@ -152,3 +152,38 @@ fn the_damaged_file_is_kept_for_whoever_wants_to_look_at_it() {
     assert!(!medium.path().with_extension("redb.new").exists());
     assert_eq!(Store::open(medium, owner(), 1).unwrap().report.damaged_count, 0);
 }
+
+/// Each read and write of an opening fails once, alone and with those after it. What the disk does not give now it may
+/// give later.
+#[test]
+fn a_disk_that_cannot_be_read_for_a_while_costs_nothing() {
+    let disk = filled();
+    let image = disk.picture();
+    let all = sorted(records());
+    let (mut refused, mut opened) = (0, 0);
+    for after in 0..400 {
+        for errors in [1, 5, u64::MAX] {
+            disk.restore(&image);
+            disk.with_faults(|faults| {
+                (faults.errors_after, faults.errors, faults.reads) = (after, errors, true);
+            });
+            let what = format!("{errors} errors after {after} operations");
+            match Store::open(disk.clone(), owner(), 1) {
+                Ok(store) => {
+                    opened += 1;
+                    assert_eq!(
+                        (store.report.damaged_count, sorted(store.restored.records)),
+                        (0, all.clone()),
+                        "{what}"
+                    );
+                }
+                Err(StoreError::Failed { .. }) => refused += 1,
+                Err(other) => panic!("{what}: {other}"),
+            }
+            disk.with_faults(|faults| faults.errors = 0);
+            let again = on(&disk);
+            assert_eq!((again.report.damaged_count, sorted(again.restored.records)), (0, all.clone()), "{what}");
+        }
+    }
+    assert!(refused > 50 && opened > 50, "{refused} refused, {opened} opened");
+}

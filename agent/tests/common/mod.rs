@@ -117,6 +117,9 @@ impl Core for Puppet {
     fn status(&self) -> StatusView {
         real_core_of_nobody().status()
     }
+    fn store_fails(&self) -> bool {
+        false
+    }
     fn snapshot(&self, now: Instant) -> Snapshot {
         real_core_of_nobody().snapshot(now)
     }

@@ -96,14 +96,15 @@ impl Gossip {
     }
 
     /// Keeps a blob. Beyond [`BLOBS_MAX`] one goes that is not among `ours`, which are called for only then: what others
-    /// made they can serve themselves.
+    /// made they can serve themselves. If all are ours, what others made is not kept.
     pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>, ours: impl FnOnce() -> BTreeSet<Hash>) {
         if self.blobs.len() >= BLOBS_MAX && !self.blobs.contains_key(&hash) {
             let ours = ours();
             let foreign = self.blobs.keys().find(|hash| !ours.contains(hash)).copied();
             match foreign {
                 Some(foreign) => _ = self.blobs.remove(&foreign),
-                None => _ = self.blobs.pop_first(),
+                None if ours.contains(&hash) => _ = self.blobs.pop_first(),
+                None => return,
             }
         }
         self.blobs.insert(hash, bytes);
@@ -384,5 +385,39 @@ impl Agent {
         for query in expired {
             self.on_answered(query, None);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn blob(number: usize) -> (Hash, Vec<u8>) {
+        let bytes = number.to_le_bytes().to_vec();
+        (Hash::of(&bytes), bytes)
+    }
+
+    #[test]
+    fn what_others_made_goes_first_and_never_for_what_others_made_alone() {
+        let mut gossip = Gossip::new(RobotId([1; 8]), &GossipConfig::default(), Instant::ZERO);
+        let ours: BTreeSet<Hash> = (0..=BLOBS_MAX).map(|number| blob(number).0).collect();
+        let add = |gossip: &mut Gossip, number| {
+            let (hash, bytes) = blob(number);
+            gossip.add_blob(hash, bytes, || ours.clone());
+        };
+        let held = |gossip: &Gossip, numbers: core::ops::Range<usize>| {
+            numbers.filter(|number| gossip.blob(blob(*number).0).is_some()).count()
+        };
+        let foreign = BLOBS_MAX + 1..2 * BLOBS_MAX + 1;
+        (1..BLOBS_MAX).for_each(|number| add(&mut gossip, number));
+        foreign.clone().for_each(|number| add(&mut gossip, number));
+        assert_eq!((held(&gossip, 0..BLOBS_MAX), held(&gossip, foreign.clone())), (BLOBS_MAX - 1, 1));
+        add(&mut gossip, 0);
+        assert_eq!((held(&gossip, 0..BLOBS_MAX), held(&gossip, foreign.clone())), (BLOBS_MAX, 0));
+        add(&mut gossip, foreign.start);
+        assert_eq!((held(&gossip, 0..BLOBS_MAX), held(&gossip, foreign)), (BLOBS_MAX, 0));
+        add(&mut gossip, BLOBS_MAX);
+        assert_eq!(held(&gossip, 0..BLOBS_MAX + 1), BLOBS_MAX);
+        assert!(gossip.blob(blob(BLOBS_MAX).0).is_some(), "the latest of ours is served");
     }
 }

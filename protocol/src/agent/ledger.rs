@@ -22,6 +22,8 @@ pub(super) struct Ledger {
     pub(super) waiting: BTreeMap<u64, Batch>,
     /// The disk refused, and has not taken anything since.
     pub(super) fails: bool,
+    /// It was told that nobody would take a fact of our epoch.
+    limit_told: bool,
 }
 
 /// What takes effect once it is durable.
@@ -34,8 +36,8 @@ pub(super) struct Batch {
 
 impl Agent {
     /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
-    /// here; what was under way waits for the disk with the rest.
-    pub(super) fn write(&mut self, epoch: u32, fact: &Fact) {
+    /// here; what was under way waits for the disk with the rest. False if the fact cannot be written.
+    pub(super) fn write(&mut self, epoch: u32, fact: &Fact) -> bool {
         match self.replica.append(&self.me.key, epoch, fact) {
             Ok(entry) => self.ledger.open.push(Record::Entry { id: entry.id(), bytes: entry.encode() }),
             Err(error) => {
@@ -43,8 +45,10 @@ impl Agent {
                 if matches!(error, AppendError::NewEpochNeeded(frame, _) if frame == self.me.frame) {
                     self.begin_epoch(self.me.frame.epoch.saturating_add(1));
                 }
+                return false;
             }
         }
+        true
     }
 
     /// Takes an entry from a peer; it takes effect once it is durable. Whether it changed anything.
@@ -57,22 +61,24 @@ impl Agent {
                     if self.replica.is_floor(id) {
                         self.ledger.open.push(Record::Replaced { below: id, submaps: vec![], blobs: vec![] });
                     }
-                    self.meet_own_past(id);
+                    self.meet_own_past(id.frame);
                 }
                 return true;
             }
-            // We signed it: there is more of this past, and what we wrote before it comes would be refused.
-            Ok(Ingested::Early(id)) if id.frame.robot == self.me.robot && id.frame.epoch >= self.me.frame.epoch => {
-                self.meet_own_past(id);
-            }
-            Ok(Ingested::Known | Ingested::Early(_)) => {}
+            Ok(Ingested::Early(id)) => self.meet_own_end(id.frame),
+            Ok(Ingested::Known) => {}
             Err(error @ IngestError::Fork(frame)) => {
                 self.reject(Some(frame.robot), error.reason(), &error.to_string());
                 self.keep_proof(frame);
                 self.relearn();
                 return true;
             }
-            Err(error) => self.reject(from, error.reason(), &error.to_string()),
+            Err(error) => {
+                self.reject(from, error.reason(), &error.to_string());
+                if let IngestError::TooEarly(id) = error {
+                    self.meet_own_end(id.frame);
+                }
+            }
         }
         false
     }
@@ -98,12 +104,12 @@ impl Agent {
         let proof = self.replica.forks().find(|(forked, _)| *forked == frame);
         let proof = proof.map(|(_, proof)| [proof.a.clone(), proof.b.clone()]);
         self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
+        self.meet_own_end(frame);
     }
 
     /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide, and
     /// no later run may take this log for one to go on with: what we hold of it may be less than others do.
-    fn meet_own_past(&mut self, id: EntryId) {
-        let FrameId { robot, epoch } = id.frame;
+    fn meet_own_past(&mut self, FrameId { robot, epoch }: FrameId) {
         if robot != self.me.robot {
             return;
         }
@@ -111,6 +117,15 @@ impl Agent {
             self.begin_epoch(epoch.saturating_add(1));
         } else {
             self.ledger.open.push(Record::EpochClosed { epoch });
+            self.tell_of_limit();
+        }
+    }
+
+    /// The same of a past that we cannot hold, because it has two histories or its beginning is yet to come: what we write
+    /// before the end of it would be refused.
+    fn meet_own_end(&mut self, frame: FrameId) {
+        if frame.epoch >= self.me.frame.epoch {
+            self.meet_own_past(frame);
         }
     }
 
@@ -122,7 +137,14 @@ impl Agent {
         self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
         self.mapper.restart(&self.config.submap);
         self.event(Event::EpochBegan { frame: self.me.frame });
-        if let Some(error) = self.epoch_limit() {
+        self.tell_of_limit();
+    }
+
+    /// Epochs become too many because a new one begins, or because old ones of ours come back.
+    fn tell_of_limit(&mut self) {
+        if let Some(error) = self.epoch_limit()
+            && !core::mem::replace(&mut self.ledger.limit_told, true)
+        {
             self.event(Event::ReceiveOnly { reason: error.to_string() });
         }
     }
@@ -134,7 +156,12 @@ impl Agent {
 
     /// Nothing of our own can be written now. What others write is heard, kept if the disk takes it, and served.
     pub(super) fn is_receive_only(&self) -> bool {
-        self.ledger.fails || self.epoch_limit().is_some()
+        self.store_fails() || self.epoch_limit().is_some()
+    }
+
+    /// The disk refuses what must be kept: nothing that waits for it will be durable soon.
+    pub fn store_fails(&self) -> bool {
+        self.ledger.fails
     }
 
     /// Why nobody would take a fact of our epoch.
@@ -168,12 +195,10 @@ impl Agent {
             self.event(Event::StoreHealed);
         }
         let mut own = Vec::new();
-        let mut entries = Vec::new();
+        let (mut entries, mut blobs) = (Vec::new(), Vec::new());
         for batch in durable.into_values() {
             entries.extend(batch.entries);
-            for (hash, bytes) in batch.blobs {
-                self.gossip.add_blob(hash, bytes, || self.knowledge.blobs_of(self.me.robot));
-            }
+            blobs.extend(batch.blobs);
         }
         self.gossip.spread.on_news(self.now, entries.len());
         for id in entries {
@@ -182,6 +207,10 @@ impl Agent {
             if id.frame.robot == self.me.robot {
                 own.push(id);
             }
+        }
+        // Only now it is known that they are ours.
+        for (hash, bytes) in blobs {
+            self.gossip.add_blob(hash, bytes, || self.knowledge.blobs_of(self.me.robot));
         }
         self.publish_entries(&own);
     }

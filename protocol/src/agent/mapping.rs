@@ -93,11 +93,6 @@ impl Agent {
         let Some((_, id)) = self.mapper.describing.take_if(|(running, _)| *running == job) else { return };
         let blob = described.keypoints.encode();
         let hash = Hash::of(&blob);
-        self.ledger.open.push(Record::Private { submap: id, bytes: described.features.encode() });
-        self.keep_keypoints(hash, &blob);
-        self.ledger.open.push(Record::Blob { hash, bytes: blob });
-        self.event(Event::SubmapFinished { submap: id, keypoints: described.keypoints.len() });
-        self.negotiation.add_features(id, Arc::new(described.features));
         // The epoch may have ended meanwhile: the submap still belongs to the frame it was driven in.
         let fact = Fact::Submap(SubmapFact {
             index: submap.index,
@@ -109,7 +104,14 @@ impl Agent {
             blob: hash,
             scale: self.config.submap.scale,
         });
-        self.write(id.frame.epoch, &fact);
+        if !self.write(id.frame.epoch, &fact) {
+            return;
+        }
+        self.ledger.open.push(Record::Private { submap: id, bytes: described.features.encode() });
+        self.keep_keypoints(hash, &blob);
+        self.ledger.open.push(Record::Blob { hash, bytes: blob });
+        self.event(Event::SubmapFinished { submap: id, keypoints: described.keypoints.len() });
+        self.negotiation.add_features(id, Arc::new(described.features));
     }
 
     /// After a restart: the trajectory goes on from the last submap that is durable.
@@ -165,7 +167,7 @@ impl Agent {
             return self.reject(Some(self.me.robot), "sighting: overload", &detail);
         }
         match self.sighting_fact(sighting) {
-            Ok(fact) => self.write(self.me.frame.epoch, &Fact::Sighting(fact)),
+            Ok(fact) => _ = self.write(self.me.frame.epoch, &Fact::Sighting(fact)),
             Err(detail) => self.reject(Some(self.me.robot), "sighting", detail),
         }
     }

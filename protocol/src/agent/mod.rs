@@ -55,6 +55,7 @@ use steps::Steps;
 use thiserror::Error;
 
 pub use condensing::GONE_IN_A_ROW_MAX;
+pub use gossip::BLOBS_MAX;
 pub use knowledge::Agreement;
 pub use negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP,
@@ -264,6 +265,9 @@ impl Agent {
         if let Some(epoch) = self.replica.epochs_of(self.me.robot).next_back() {
             self.me.frame.epoch = epoch;
         }
+        if self.replica.is_quarantined(self.me.frame) {
+            closed = closed.max(Some(self.me.frame.epoch));
+        }
         if let Err(damage) = loaded {
             self.reject(None, "store", &damage.to_string());
             closed = closed.max(damage.concerns(self.me.frame).then_some(self.me.frame.epoch));
@@ -272,8 +276,10 @@ impl Agent {
             self.begin_epoch(closed.saturating_add(1).max(fresh_epoch));
         }
         self.relearn();
-        // Only now it is known which are ours.
-        blobs.into_iter().for_each(|bytes| self.keep_blob(bytes));
+        // Only now it is known which are ours; of others as many are taken as there is room for.
+        let ours = self.knowledge.blobs_of(self.me.robot);
+        let (own, foreign): (Vec<_>, Vec<_>) = blobs.into_iter().partition(|bytes| ours.contains(&Hash::of(bytes)));
+        own.into_iter().chain(foreign).take(BLOBS_MAX).for_each(|bytes| self.keep_blob(bytes));
         for (submap, bytes) in private {
             self.restore_features(submap, &bytes);
         }

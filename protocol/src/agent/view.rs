@@ -55,8 +55,9 @@ impl Agent {
 
     /// Work that this robot still has to do with the facts it holds.
     fn pending(&self) -> u64 {
-        let aligning = self.negotiation.running.len() + self.answers_owed().len() + self.proposals();
-        self.unsaved() + aligning as u64
+        // What nobody would take is not to be done.
+        let open = if self.epoch_limit().is_some() { 0 } else { self.answers_owed().len() + self.proposals() };
+        self.unsaved() + (self.negotiation.running.len() + open) as u64
     }
 
     /// What a restart now would lose.

@@ -29,9 +29,8 @@ impl<C: Core> Swarm<C> {
             Ok(booted) => booted,
             // The advice that the error gives is taken: the file is moved away.
             Err(StoreError::NotAStore { .. }) => {
-                robot.store.wipe();
+                self.wipe(index);
                 self.counts.store_moved_away += 1;
-                self.see(index, &Seen::Wiped);
                 return self.boot(now, index);
             }
             Err(_) => {
@@ -121,9 +120,8 @@ impl<C: Core> Swarm<C> {
             }
             Fault::Wipe { .. } => {
                 self.kill(now, robot);
-                self.robots[robot].store.wipe();
+                self.wipe(robot);
                 self.counts.wiped += 1;
-                self.see(robot, &Seen::Wiped);
             }
             Fault::FlipBits { bits, .. } => self.flip(now, robot, *bits),
             Fault::OldImage { .. } => {
@@ -131,11 +129,11 @@ impl<C: Core> Swarm<C> {
             }
             Fault::LyingDisk { .. } => self.robots[robot].store.disk().with_faults(|faults| faults.lies = true),
             Fault::DiskFull { .. } => self.robots[robot].store.disk().with_faults(|faults| faults.full = true),
-            Fault::DiskErrors { errors, .. } => {
+            Fault::DiskErrors { errors, reads, .. } => {
                 let seed = Dice::new(self.seed, &format!("errors {index}")).bits();
                 let after = seed % 16;
                 let change = |faults: &mut merganser_store::simulated::Faults| {
-                    (faults.errors_after, faults.errors, faults.seed) = (after, *errors, seed);
+                    (faults.errors_after, faults.errors, faults.reads, faults.seed) = (after, *errors, *reads, seed);
                 };
                 self.robots[robot].store.disk().with_faults(change);
                 self.robots[robot].suspect = true;
@@ -217,13 +215,21 @@ impl<C: Core> Swarm<C> {
         for robot in 0..self.robots.len() {
             self.trust_disk(robot);
             self.robots[robot].store.disk().with_faults(|faults| {
-                (faults.full, faults.errors, faults.dies_after) = (false, 0, None);
+                (faults.full, faults.errors, faults.reads, faults.dies_after) = (false, 0, false, None);
             });
             self.boot(now, robot)?;
         }
         self.reach();
         self.update_hearing(now);
         Ok(())
+    }
+
+    /// What was wrong with its bytes is gone with them; what is wrong with the disk is not.
+    fn wipe(&mut self, index: usize) {
+        let robot = &mut self.robots[index];
+        robot.store.wipe();
+        robot.suspect &= robot.store.disk().with_faults(|faults| faults.errors > 0);
+        self.see(index, &Seen::Wiped);
     }
 
     fn trust_disk(&mut self, robot: usize) {

@@ -65,10 +65,10 @@ impl<C: Core> Swarm<C> {
         let robots = self.robot_samples(now);
         self.pin_frames(&robots);
         self.agreed_since = self.agreed_since.or(Some(now)).filter(|_| self.healed && all_agree(&robots));
-        let done = self.healed && all_done(&robots);
+        let (down, expect) = (self.down(), &self.scenario.expect);
+        let done = self.healed && down.is_empty() && all_done(&robots);
         self.done_samples = if done { self.done_samples + 1 } else { 0 };
         let phase = if self.healed { Phase::Calm } else { Phase::Storm };
-        let (down, expect) = (self.down(), &self.scenario.expect);
         let sample = Sample { at: now, phase, robots, down, truth: &self.truth, expect };
         let (checks, stopwatch) = (&mut self.checks, &mut self.stopwatch);
         if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {

@@ -247,10 +247,11 @@ impl<C: Core> Swarm<C> {
         self.pin_frames(&robots);
         let snapshots = robots.iter().filter_map(|robot| robot.snapshot.as_ref());
         for robot in &self.robots {
-            let (no_room, failed) =
-                robot.store.disk().with_faults(|faults| (faults.refused_full, faults.refused_error));
-            self.counts.writes_without_room += no_room;
-            self.counts.writes_failed += failed;
+            robot.store.disk().with_faults(|faults| {
+                self.counts.writes_without_room += faults.refused_full;
+                self.counts.writes_failed += faults.refused_error;
+                self.counts.reads_failed += faults.refused_reads;
+            });
         }
         self.counts.held_back = snapshots.flat_map(|snapshot| snapshot.stats.held_back.values()).sum();
         if self.violation.is_none() {

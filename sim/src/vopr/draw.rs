@@ -29,6 +29,9 @@ const SOLVE_SHARE: f64 = 0.15;
 /// them, for everybody's facts cross every link, and within the stated time they must be able to.
 const SLOW_LINK_SHARE: f64 = 0.25;
 const SLOW_LINK: [f64; 2] = [4_000.0, 40_000.0];
+/// Shares of the runs in which the swarm is also split for so long, s; crowds not for the longest.
+const LONG_SPLITS: [(f64, f64); 2] = [(0.03, 180.0), (0.005, 1800.0)];
+const CROWD_SPLIT_SECS_MAX: f64 = 180.0;
 /// Faults begin after this, s: robots boot first.
 const CALM_SECS: f64 = 2.0;
 
@@ -69,8 +72,30 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
     scenario.machine.start_within_secs = scenario.machine.start_within_secs.min(0.3 * duration_secs);
     let liars = if solve { liars(&scenario, &mut dice) } else { Vec::new() };
     scenario.summary = Some(SummaryOptions { solve, liars, ..SummaryOptions::default() });
-    scenario.faults = faults(&scenario, seed, solve);
+    let split_secs = split_secs(robots, &mut Dice::new(seed, "vopr long"));
+    if let Some(split_secs) = split_secs {
+        slow_down(&mut scenario, split_secs);
+    }
+    scenario.faults = faults(&scenario, seed, solve, split_secs);
     scenario
+}
+
+/// How long the swarm is split in a long run, if this is one.
+fn split_secs(robots: usize, dice: &mut Dice) -> Option<f64> {
+    let drawn = dice.range(0.0, 1.0);
+    let mut below = 0.0;
+    let long = LONG_SPLITS.iter().find(|(share, _)| {
+        below += share;
+        drawn < below
+    });
+    long.map(|(_, secs)| *secs).filter(|secs| robots <= CROWD || *secs <= CROWD_SPLIT_SECS_MAX)
+}
+
+/// Makes room for a long split. Robots write as much as in a short run: what all must hear of in the stated time is no more.
+fn slow_down(scenario: &mut Scenario, split_secs: f64) {
+    let shorter = scenario.duration_secs;
+    scenario.duration_secs += split_secs;
+    scenario.drive.speed_m_s *= shorter / scenario.duration_secs;
 }
 
 /// By how much keyframes lie farther apart than among few robots.
@@ -164,7 +189,7 @@ struct Faults<'a> {
     faults: Vec<Fault>,
 }
 
-fn faults(scenario: &Scenario, seed: u64, solve: bool) -> Vec<Fault> {
+fn faults(scenario: &Scenario, seed: u64, solve: bool, split_secs: Option<f64>) -> Vec<Fault> {
     let dice = Dice::new(seed, "vopr faults");
     let mut drawn = Faults { dice, names: scenario.names(), scenario, faults: Vec::new() };
     let rounds = (scenario.robots / CROWD).clamp(1, ROUNDS_MAX);
@@ -181,6 +206,12 @@ fn faults(scenario: &Scenario, seed: u64, solve: bool) -> Vec<Fault> {
     }
     drawn.dice = Dice::new(seed, "vopr new frames");
     (0..rounds).for_each(|_| drawn.new_frames());
+    drawn.dice = Dice::new(seed, "vopr reads");
+    (0..rounds).for_each(|_| drawn.reads());
+    if let Some(lasts) = split_secs {
+        drawn.dice = Dice::new(seed, "vopr long split");
+        drawn.long_split(lasts);
+    }
     drawn.faults.sort_by(|a, b| a.begins().total_cmp(&b.begins()));
     drawn.faults
 }
@@ -310,12 +341,27 @@ impl Faults<'_> {
         }
         if self.happens(0.25) {
             let ((at, _), robot, errors) = (self.when(0.0, 0.0), self.robot(), self.times(30));
-            self.faults.push(Fault::DiskErrors { at, robot, errors });
+            self.faults.push(Fault::DiskErrors { at, robot, errors, reads: false });
         }
         if self.happens(0.2) {
             let ((at, lasts), robot) = (self.when(0.5, 15.0), self.robot());
             self.faults.push(Fault::Wipe { at, lasts, robot });
         }
+    }
+
+    /// A disk that cannot be read, and the robot must: it starts anew.
+    fn reads(&mut self) {
+        if self.happens(0.15) {
+            let ((at, lasts), robot, errors) = (self.when(0.5, 10.0), self.robot(), self.times(30));
+            self.faults.push(Fault::DiskErrors { at, robot: robot.clone(), errors, reads: true });
+            self.faults.push(Fault::Kill { at, lasts, robot });
+        }
+    }
+
+    fn long_split(&mut self, lasts: f64) {
+        let at = self.dice.range(CALM_SECS, self.scenario.duration_secs - lasts);
+        let groups = self.halves();
+        self.faults.push(Fault::Partition { at, lasts, groups });
     }
 
     fn doubtful_disks(&mut self) {

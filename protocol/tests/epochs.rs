@@ -1,0 +1,184 @@
+//! Epochs: what this robot wrote before its store was lost is never written on, and there is an end to them.
+#![allow(missing_docs, clippy::unwrap_used, reason = "a test fails by panicking")]
+
+mod common;
+
+use common::{Wires, World, agent, drive, name, robot};
+use merganser_protocol::agent::io::{Channel, Command, Event, Input, Output, Record};
+use merganser_protocol::agent::{Agent, Restored};
+use merganser_protocol::ids::{EntryId, FrameId};
+use merganser_protocol::replica::{EARLY_PER_ROBOT_MAX, Replica};
+use merganser_protocol::time::Instant;
+use merganser_protocol::wire::EntryBytes;
+use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
+use merganser_protocol::wire::messages::Message;
+use std::time::Duration;
+
+fn drain(agent: &mut Agent) -> Vec<Output> {
+    std::iter::from_fn(|| agent.poll_output()).collect()
+}
+
+/// A fact, one for each number.
+fn verdict(seq: u32) -> Fact {
+    Fact::Verdict(VerdictFact {
+        alignment: EntryId { frame: FrameId { robot: robot(1), epoch: 1 }, seq },
+        outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
+    })
+}
+
+/// What alpha wrote into an epoch, and where this begins to differ.
+fn past(epoch: u32, facts: impl IntoIterator<Item = u32>) -> Vec<Vec<u8>> {
+    let key = ed25519_dalek::SigningKey::from_bytes(&common::secret(0));
+    let members = [(name(0), common::public(0))];
+    let mut past = Replica::new(&common::identity(0).swarm, members, &common::config().gossip).unwrap();
+    facts.into_iter().map(|seq| past.append(&key, epoch, &verdict(seq)).unwrap().encode()).collect()
+}
+
+fn hear(wires: &mut Wires, entries: &[Vec<u8>]) {
+    let bytes = Message::Facts(entries.iter().cloned().map(EntryBytes).collect()).encode();
+    wires.input(0, Input::Received { from: robot(1), channel: Channel::Facts, bytes });
+}
+
+/// Alpha's store was lost, and the clock went back.
+fn lost() -> Wires {
+    Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 2 })])
+}
+
+fn is_told(wires: &Wires) -> bool {
+    wires.events.iter().any(|(_, event)| matches!(event, Event::ReceiveOnly { .. }))
+}
+
+/// Nothing that alpha writes is refused.
+fn writes(wires: &mut Wires) {
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    keyframes.into_iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe)));
+    wires.input(0, Input::Command(Command::Flush));
+    let rejected = wires.agents[0].snapshot(wires.now).stats.rejected;
+    assert!(wires.agents[0].status().submaps > 1 && !rejected.contains_key("own fact"), "{rejected:?}");
+}
+
+#[test]
+fn a_robot_at_its_last_epoch_writes_and_beyond_it_only_listens_and_says_why() {
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    let mut config = common::config();
+    config.gossip.epochs_per_robot_max = 2;
+    let mut wires = Wires::new(vec![common::agent_of(0, &config)]);
+    let drive_and_end = |wires: &mut Wires| {
+        keyframes.iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe.clone())));
+        wires.input(0, Input::Command(Command::NewEpoch));
+    };
+    drive_and_end(&mut wires);
+    assert!(!wires.agents[0].status().receive_only && !is_told(&wires), "the second epoch is its last");
+    drive_and_end(&mut wires);
+    assert_eq!(wires.agents[0].heads().count(), 2);
+    assert!(wires.agents[0].status().receive_only && is_told(&wires));
+    let (kept, taken) = (wires.disks[0].len(), wires.agents[0].status().keyframes);
+    drive_and_end(&mut wires);
+    let status = wires.agents[0].status();
+    assert_eq!((wires.disks[0].len(), status.keyframes, status.unsaved), (kept + 1, taken, 0), "but the epoch's end");
+    let refused = wires.agents[0].snapshot(wires.now).stats.rejected["keyframe: receive-only"];
+    assert_eq!(refused, keyframes.len() as u64);
+    // What others write is heard and kept.
+    let other = agent(1, Restored::default());
+    wires = Wires::new(vec![wires.agents.remove(0), other]);
+    keyframes.iter().for_each(|keyframe| wires.input(1, Input::Keyframe(keyframe.clone())));
+    wires.input(1, Input::Command(Command::Flush));
+    wires.run(Duration::from_secs(5));
+    assert_eq!(wires.agents[0].heads().count(), 3);
+}
+
+#[test]
+fn no_epoch_comes_after_the_last() {
+    let mut agent = agent(0, Restored { records: vec![], fresh_epoch: u32::MAX - 2 });
+    let mut status = || {
+        agent.handle(Instant::ZERO, Input::Command(Command::NewEpoch));
+        let is_told = drain(&mut agent).iter().any(|output| matches!(output, Output::Event(Event::ReceiveOnly { .. })));
+        (agent.frame().epoch, agent.status().receive_only, is_told)
+    };
+    assert_eq!(status(), (u32::MAX - 1, false, false));
+    assert_eq!(status(), (u32::MAX, true, true));
+}
+
+#[test]
+fn the_end_of_an_own_past_whose_beginning_is_yet_to_come_closes_it() {
+    let mut wires = lost();
+    hear(&mut wires, &past(9, 0..3)[2..]);
+    assert_eq!(wires.agents[0].frame().epoch, 10);
+    writes(&mut wires);
+}
+
+#[test]
+fn an_own_past_of_which_too_much_waits_for_its_beginning_closes_it() {
+    let mut wires = lost();
+    // As many as may wait, of an epoch that is closed by now.
+    let waiting = EARLY_PER_ROBOT_MAX as u32;
+    hear(&mut wires, &past(1, 0..=waiting)[1..]);
+    assert_eq!(wires.agents[0].frame().epoch, 2, "an older one concerns nobody");
+    hear(&mut wires, &past(9, 0..=waiting + 1)[waiting as usize + 1..]);
+    assert!(wires.agents[0].snapshot(wires.now).stats.rejected.contains_key("too_early"));
+    assert_eq!(wires.agents[0].frame().epoch, 10);
+    writes(&mut wires);
+}
+
+#[test]
+fn an_own_past_with_two_histories_is_closed_whoever_proves_it() {
+    let frame = FrameId { robot: robot(0), epoch: 9 };
+    let proof = [past(9, [0]), past(9, [1])].map(|story| story[0].clone());
+    let fork = Record::Fork { frame, proof: proof.clone() };
+    // A peer, in the answer to a question.
+    let beta = agent(1, Restored { records: vec![fork.clone()], fresh_epoch: 0 });
+    let mut wires = Wires::new(vec![lost().agents.remove(0), beta]);
+    wires.run(Duration::from_secs(5));
+    assert_eq!(wires.agents[0].frame().epoch, 10);
+    writes(&mut wires);
+    // Our own store.
+    wires = Wires::new(vec![agent(0, Restored { records: vec![fork], fresh_epoch: 2 })]);
+    assert_eq!(wires.agents[0].frame().epoch, 10);
+    writes(&mut wires);
+    // Older ones concern nobody.
+    wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 12 })]);
+    hear(&mut wires, &proof);
+    assert_eq!(wires.agents[0].frame().epoch, 12);
+}
+
+#[test]
+fn own_epochs_that_come_back_can_be_too_many_which_is_told_once() {
+    let mut config = common::config();
+    config.gossip.epochs_per_robot_max = 2;
+    let restored = Restored { records: vec![], fresh_epoch: 12 };
+    let alpha = Agent::new(config, common::identity(0), 0, restored, Instant::ZERO).unwrap();
+    let mut wires = Wires::new(vec![alpha]);
+    hear(&mut wires, &past(3, 0..2));
+    assert!(!wires.agents[0].status().receive_only && !is_told(&wires));
+    for _ in 0..2 {
+        hear(&mut wires, &past(4, 0..2));
+    }
+    let status = wires.agents[0].status();
+    assert!(status.receive_only);
+    assert_eq!((wires.agents[0].frame().epoch, status.entries), (12, 4));
+    let told = wires.events.iter().filter(|(_, event)| matches!(event, Event::ReceiveOnly { .. })).count();
+    assert_eq!(told, 1, "{:?}", wires.events);
+}
+
+#[test]
+fn of_a_submap_that_cannot_be_stated_nothing_is_kept() {
+    let mut alpha = agent(0, Restored { records: vec![], fresh_epoch: 2 });
+    let (keyframes, _) = drive(&World::new(1), 0, 8);
+    keyframes.into_iter().for_each(|keyframe| alpha.handle(Instant::ZERO, Input::Keyframe(keyframe)));
+    let run = drain(&mut alpha).into_iter().find_map(|output| match output {
+        Output::Run { id, job } if job.kind() == "describe" => Some((id, job)),
+        _ => None,
+    });
+    let (job, run) = run.unwrap();
+    // While it is described, a later epoch of ours comes back.
+    let bytes = Message::Facts(past(9, 0..1).into_iter().map(EntryBytes).collect()).encode();
+    alpha.handle(Instant::ZERO, Input::Received { from: robot(1), channel: Channel::Facts, bytes });
+    drain(&mut alpha);
+    alpha.handle(Instant::ZERO, Input::JobDone { job, result: run.run() });
+    let outputs = drain(&mut alpha);
+    let keeps =
+        |output: &Output| matches!(output, Output::Persist { .. } | Output::Event(Event::SubmapFinished { .. }));
+    assert!(!outputs.iter().any(keeps), "{outputs:?}");
+    assert_eq!(alpha.status().submaps, 0);
+    assert!(alpha.snapshot(Instant::ZERO).stats.rejected.contains_key("own fact"));
+}
