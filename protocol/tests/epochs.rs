@@ -5,10 +5,11 @@ mod common;
 
 use common::{Wires, World, agent, drive, name, robot};
 use merganser_protocol::agent::io::{Channel, Command, Event, Input, Output, Record};
-use merganser_protocol::agent::{Agent, Restored};
+use merganser_protocol::agent::{Agent, CLOCK_BACK_KEYFRAMES, Restored};
 use merganser_protocol::ids::{EntryId, FrameId};
 use merganser_protocol::replica::{EARLY_PER_ROBOT_MAX, Replica};
-use merganser_protocol::time::Instant;
+use merganser_protocol::submap::Keyframe;
+use merganser_protocol::time::{Instant, Stamp};
 use merganser_protocol::wire::EntryBytes;
 use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
 use merganser_protocol::wire::messages::Message;
@@ -181,4 +182,44 @@ fn of_a_submap_that_cannot_be_stated_nothing_is_kept() {
     assert!(!outputs.iter().any(keeps), "{outputs:?}");
     assert_eq!(alpha.status().submaps, 0);
     assert!(alpha.snapshot(Instant::ZERO).stats.rejected.contains_key("own fact"));
+}
+
+/// Alpha, after a drive and a step of its clock by so many seconds, drives on. Keyframes come so far apart.
+fn after_a_step(secs: i64, apart: Duration) -> Wires {
+    let (keyframes, _) = drive(&World::new(1), 0, 19);
+    let mut wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 2 })]);
+    for (k, keyframe) in keyframes.into_iter().enumerate() {
+        let stamp = Stamp(keyframe.stamp.0 + i64::from(k >= 4) * secs * 1_000_000_000);
+        wires.input(0, Input::Keyframe(Keyframe { stamp, ..keyframe }));
+        wires.run(apart);
+    }
+    wires
+}
+
+#[test]
+fn a_clock_that_goes_back_for_good_begins_a_new_epoch() {
+    let status = |secs, apart| {
+        let status = after_a_step(secs, apart).agents[0].status();
+        (status.epoch, status.keyframes)
+    };
+    let (slow, fast) = (Duration::from_secs(2), Duration::from_millis(100));
+    let refused = u64::from(CLOCK_BACK_KEYFRAMES);
+    assert_eq!(status(-3600, slow), (3, 19 - refused));
+    assert_eq!(status(3600, slow), (2, 19), "forth is no matter");
+    assert_eq!(status(-3600, fast), (2, 4), "what is late comes all at once");
+    let late = Duration::from_secs_f64(10.0 / f64::from(CLOCK_BACK_KEYFRAMES));
+    assert_eq!(status(-3600, late), (3, 19 - refused - 1), "ten seconds are asked for, too");
+}
+
+#[test]
+fn keyframes_that_come_late_between_others_begin_no_epoch() {
+    let (keyframes, _) = drive(&World::new(1), 0, 19);
+    let mut wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: 2 })]);
+    for (k, keyframe) in keyframes.iter().enumerate() {
+        wires.input(0, Input::Keyframe(keyframe.clone()));
+        wires.input(0, Input::Keyframe(keyframes[k.saturating_sub(3)].clone()));
+        wires.run(Duration::from_secs(2));
+    }
+    let status = wires.agents[0].status();
+    assert_eq!((status.epoch, status.keyframes), (2, 19));
 }

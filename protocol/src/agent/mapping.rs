@@ -7,8 +7,10 @@ use super::ledger::BATCHES_WAITING_MAX;
 use crate::config::SubmapConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use crate::ids::{Hash, SubmapId};
-use crate::submap::{Described, Features, Keyframe, Keypoints, Submap, SubmapBuilder};
+use crate::submap::{Described, Features, Keyframe, KeyframeError, Keypoints, Submap, SubmapBuilder};
+use crate::time::{Instant, Stamp};
 use crate::wire::fact::{Fact, SightingFact, SubmapFact};
+use core::time::Duration;
 use nalgebra::{Matrix6, Vector3};
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -16,22 +18,48 @@ use std::sync::Arc;
 /// Finished submaps waiting to be described. Beyond it keyframes are refused: the computer is too slow for its sensor.
 pub const DESCRIBE_QUEUE_MAX: usize = 64;
 
+/// A clock that went back and stays there is one whose stamps are refused, and rise, for so many keyframes in a row and
+/// for so long. Keyframes that are only late come all at once, or between others.
+pub const CLOCK_BACK_KEYFRAMES: u32 = 8;
+const CLOCK_BACK: Duration = Duration::from_secs(10);
+
 /// Keyframes on their way to becoming submaps.
 pub(super) struct Mapper {
     builder: SubmapBuilder,
+    behind: Option<Behind>,
     queue: VecDeque<(SubmapId, Submap)>,
     describing: Option<(JobId, SubmapId)>,
     pub(super) keyframes: u64,
 }
 
+/// Keyframes in a row that were refused because their stamps, which rise, are behind the last one taken.
+#[derive(Clone, Copy, Debug)]
+struct Behind {
+    since: Instant,
+    last: Stamp,
+    count: u32,
+}
+
 impl Mapper {
     pub(super) fn new(config: &SubmapConfig) -> Self {
-        Self { builder: SubmapBuilder::new(config.clone()), queue: VecDeque::new(), describing: None, keyframes: 0 }
+        let builder = SubmapBuilder::new(config.clone());
+        Self { builder, behind: None, queue: VecDeque::new(), describing: None, keyframes: 0 }
     }
 
     /// A new frame: what follows has nothing to do with what came before.
     pub(super) fn restart(&mut self, config: &SubmapConfig) {
         self.builder = SubmapBuilder::new(config.clone());
+        self.behind = None;
+    }
+
+    /// A keyframe with this stamp was refused as one behind. Whether the clock has gone back for good.
+    fn is_clock_back(&mut self, now: Instant, stamp: Stamp) -> bool {
+        let behind = match self.behind {
+            Some(behind) if stamp > behind.last => Behind { last: stamp, count: behind.count + 1, ..behind },
+            _ => Behind { since: now, last: stamp, count: 1 },
+        };
+        self.behind = Some(behind);
+        behind.count >= CLOCK_BACK_KEYFRAMES && now.since(behind.since) >= CLOCK_BACK
     }
 
     /// Submaps not yet described.
@@ -40,7 +68,7 @@ impl Mapper {
     }
 
     /// The last finished submap and the body's pose in its anchor.
-    pub(super) fn body(&self) -> Option<(u32, PoseWithCovariance, crate::time::Stamp)> {
+    pub(super) fn body(&self) -> Option<(u32, PoseWithCovariance, Stamp)> {
         self.builder.body_since_anchor()
     }
 }
@@ -55,12 +83,20 @@ impl Agent {
             self.reject(Some(self.me.robot), "keyframe: overload", &detail);
             return;
         }
+        let stamp = keyframe.stamp;
         match self.mapper.builder.push(keyframe) {
             Ok(closed) => {
+                self.mapper.behind = None;
                 self.mapper.keyframes += 1;
                 self.enqueue(closed);
             }
-            Err(error) => self.reject(Some(self.me.robot), "keyframe", &error.to_string()),
+            Err(error) => {
+                self.reject(Some(self.me.robot), "keyframe", &error.to_string());
+                let is_behind = matches!(error, KeyframeError::StampNotRising { .. });
+                if is_behind && self.mapper.is_clock_back(self.now, stamp) {
+                    self.begin_epoch(self.me.frame.epoch.saturating_add(1));
+                }
+            }
         }
     }
 

@@ -57,6 +57,7 @@ use thiserror::Error;
 pub use condensing::GONE_IN_A_ROW_MAX;
 pub use gossip::BLOBS_MAX;
 pub use knowledge::Agreement;
+pub use mapping::CLOCK_BACK_KEYFRAMES;
 pub use negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP,
 };
