@@ -14,6 +14,7 @@ use anyhow::{Context, ensure};
 use clap::Args;
 use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::Event;
+use merganser_protocol::geometry::Se3;
 use merganser_protocol::snapshot::Snapshot;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
@@ -150,8 +151,16 @@ fn accuracy(
     let of_alignments = oracle::alignment_errors(snapshot, anchors).context("no alignment is used")?;
     let (sigmas, claimed) = (of_alignments.true_ones, of_alignments.claimed);
     let loops = oracle::loops(anchors, OVERLAP_M);
-    let best = oracle::solve(outcome, anchors, &loops, sigmas)?;
-    let theirs = errors(anchors, |anchor| best.get(&(anchor.robot, anchor.index)).copied());
+    let given = |loops: &[(usize, usize, Se3)]| -> anyhow::Result<f64> {
+        let solved = oracle::solve(outcome, anchors, loops, sigmas)?;
+        Ok(errors(anchors, |anchor| solved.get(&(anchor.robot, anchor.index)).copied()))
+    };
+    let theirs = given(&oracle::measured(outcome.seed, anchors, &loops, sigmas))?;
+    // What is lost by weighing alignments as they are weighed, by their errors, and by there being no more of them.
+    let used = oracle::used(snapshot, anchors);
+    let pairs: BTreeSet<(usize, usize)> = used.iter().map(|&(i, j, _)| (i.min(j), i.max(j))).collect();
+    let weighed = given(&used)?;
+    let drawn = given(&oracle::measured(outcome.seed, anchors, &pairs, sigmas))?;
     let robots: BTreeSet<usize> = anchors.iter().map(|anchor| anchor.robot).collect();
     let alone = robots.iter().map(|robot| {
         let own: Vec<Anchor> = anchors.iter().filter(|anchor| anchor.robot == *robot).cloned().collect();
@@ -161,11 +170,13 @@ fn accuracy(
         out,
         "absolute trajectory error: {ours:.4} m ({joined} of {} submaps in one map); given every true loop ({}): \
          {theirs:.4} m; ratio {:.2} (goal {RATIO_MAX}); odometry of each alone: {:.3} m\n\
+         that solver given our {} alignments: {weighed:.4} m; given the same pairs with errors drawn anew: {drawn:.4} m\n\
          alignments err by {:.3} m and {:.2}° an axis (the solver's as well) and count as {:.3} m and {:.2}°",
         anchors.len(),
         loops.len(),
         ours / theirs,
         median(alone.collect()),
+        used.len(),
         sigmas.0,
         sigmas.1.to_degrees(),
         claimed.0,

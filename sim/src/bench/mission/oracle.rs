@@ -63,14 +63,38 @@ pub(super) fn loops(anchors: &[Anchor], metres: f64) -> BTreeSet<(usize, usize)>
     all
 }
 
-/// Where the solver puts each submap, by robot and index.
+/// Loops as they would be measured with errors like those of the swarm's own alignments.
+pub(super) fn measured(
+    seed: u64,
+    anchors: &[Anchor],
+    loops: &BTreeSet<(usize, usize)>,
+    (metres, radians): (f64, f64),
+) -> Vec<(usize, usize, Se3)> {
+    let mut dice = Dice::new(seed, "oracle");
+    let sigmas = [metres, metres, metres, radians, radians, radians];
+    let measure = |&(i, j): &(usize, usize)| {
+        let noise = Vector6::from_fn(|k, _| sigmas[k] * dice.normal());
+        (i, j, (anchors[i].t_world_anchor.inverse() * anchors[j].t_world_anchor).retract(&noise))
+    };
+    loops.iter().map(measure).collect()
+}
+
+/// The alignments that the swarm uses.
+pub(super) fn used(snapshot: &Snapshot, anchors: &[Anchor]) -> Vec<(usize, usize, Se3)> {
+    let names: BTreeMap<&str, usize> = anchors.iter().enumerate().map(|(k, a)| (a.name.as_str(), k)).collect();
+    let place = |name: &str| names.get(name).copied();
+    let used = snapshot.graph.edges.iter().filter(|edge| edge.weight > 0.0);
+    used.filter_map(|edge| Some((place(&edge.i)?, place(&edge.j)?, rigid(&edge.t_i_j.pose)?))).collect()
+}
+
+/// Where the solver puts each submap, by robot and index, if all alignments err by so much.
 ///
 /// # Errors
 /// Robots that it cannot bring into one frame.
 pub(super) fn solve(
     outcome: &Outcome<Agent>,
     anchors: &[Anchor],
-    loops: &BTreeSet<(usize, usize)>,
+    loops: &[(usize, usize, Se3)],
     (metres, radians): (f64, f64),
 ) -> anyhow::Result<BTreeMap<(usize, u32), Se3>> {
     let frame = |robot: usize| FrameId { robot: RobotId([robot as u8; 8]), epoch: 1 };
@@ -85,12 +109,8 @@ pub(super) fn solve(
         before.insert(anchor.robot, anchor.step);
     }
     let id = |k: usize| SubmapId { frame: frame(anchors[k].robot), index: anchors[k].index };
-    let mut dice = Dice::new(outcome.seed, "oracle");
-    let sigmas = [metres, metres, metres, radians, radians, radians];
-    let covariance = Covariance::from_sigmas(sigmas)?;
-    let alignment = |(seq, &(i, j)): (usize, &(usize, usize))| {
-        let noise = Vector6::from_fn(|k, _| sigmas[k] * dice.normal());
-        let pose = (anchors[i].t_world_anchor.inverse() * anchors[j].t_world_anchor).retract(&noise);
+    let covariance = Covariance::from_sigmas([metres, metres, metres, radians, radians, radians])?;
+    let alignment = |(seq, &(i, j, pose)): (usize, &(usize, usize, Se3))| {
         let t_i_j = Relative::Metric(PoseWithCovariance { pose, covariance });
         AgreedAlignment {
             entry: EntryId { frame: frame(anchors[i].robot), seq: seq as u32 },
