@@ -24,7 +24,7 @@ use crate::ids::{EntryId, FrameId, SubmapId};
 use std::collections::BTreeMap;
 
 /// Share of an alignment's variance that others of its submaps have in common, between submaps that a LiDAR saw.
-const COMMON_LIDAR: f64 = 0.25;
+const COMMON_LIDAR: f64 = 0.2;
 
 /// Share of an alignment's variance that others of its submaps have in common.
 pub(super) fn common(bends: bool) -> f64 {

@@ -293,7 +293,7 @@ impl Knowledge {
     }
 
     /// Whether a LiDAR saw the submap, by its owner's word.
-    fn is_of_ranges(&self, id: SubmapId) -> bool {
+    pub(super) fn is_of_ranges(&self, id: SubmapId) -> bool {
         self.submap(id).and_then(|known| known.summary.as_ref()).is_some_and(Summary::is_of_ranges)
     }
 

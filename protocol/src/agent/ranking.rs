@@ -4,7 +4,7 @@
 use super::Agent;
 use super::allowance::FACT_BYTES;
 use super::knowledge::{Agreement, Pair, pair_of};
-use super::negotiation::TRIES_PER_SUBMAP_TIED;
+use super::negotiation::{ALIGNMENTS_PER_SUBMAP, LOOPS_PER_SUBMAP, TRIES_PER_SUBMAP_FREE, TRIES_PER_SUBMAP_TIED};
 use super::shortlist::Candidate;
 use super::stated::Stated;
 use crate::geometry::Relative;
@@ -13,6 +13,8 @@ use crate::ids::SubmapId;
 /// Two frames that are tied well enough as such are aligned further where a submap has drifted from the other by this many
 /// standard deviations of an alignment.
 const NEWS_MIN: f64 = 1.0;
+/// The same where no keypoints have to be sent and many alignments of one submap say more than one.
+const NEWS_MIN_FREE: f64 = 0.25;
 /// Alignments, in units of what it takes to merge, after which two frames that still have not merged may wait with more.
 const MERGE_ATTEMPTS: usize = 2;
 
@@ -75,31 +77,39 @@ impl Agent {
         if self.is_out_of_reach(candidate.theirs) || (is_loop && self.is_out_of_reach(candidate.mine)) {
             return None;
         }
-        if stated.has_said_enough(pair, self.config.estimate.alignments_min) {
+        // What bends a camera's submap is common to all its alignments: of LiDARs' alone many say more than a few.
+        let averages = [pair.0, pair.1].into_iter().all(|id| self.knowledge.is_of_ranges(id));
+        let limit = if is_loop && averages { LOOPS_PER_SUBMAP } else { ALIGNMENTS_PER_SUBMAP };
+        if stated.most_of_either(pair) >= limit.max(self.config.estimate.alignments_min) {
             return None;
         }
+        let lacking = self.blobs_lacking(candidate, stated);
         let is_tied = stated.is_tied(pair);
         let worth = candidate.similarity + if candidate.wished { 0.5 } else { 0.0 };
         let Some((at_a, at_b)) = self.anchor(pair.0).zip(self.anchor(pair.1)) else {
             return (!is_tied).then_some(1.5 + worth);
         };
-        if !self.may_touch(pair, at_a, at_b) {
-            return None;
-        }
+        let near = self.nearness(pair, at_a, at_b)?;
         let news = stated.sigma(pair).map(|sigma| drift_between(at_a, at_b) / (sigma * at_b.sim().scale));
-        let is_news = self.negotiation.tries(candidate) < TRIES_PER_SUBMAP_TIED && news >= Some(NEWS_MIN);
-        if is_tied && !is_news {
+        let (tries, least) = match lacking == 0 && averages {
+            true => (TRIES_PER_SUBMAP_FREE, NEWS_MIN_FREE),
+            false => (TRIES_PER_SUBMAP_TIED, NEWS_MIN),
+        };
+        if is_tied && (self.negotiation.tries(candidate) >= tries || news < Some(least)) {
             return None;
         }
         // Loops of our own come first: they take no keypoints.
         let share = news.filter(|_| !is_loop).map_or(1.0, |news| news / (1.0 + news));
-        Some(0.5 * worth * share / (1 + self.blobs_lacking(candidate, stated)) as f64)
+        Some(0.5 * worth * near * share / (1 + lacking) as f64)
     }
 
-    /// Whether the two submaps overlap, as far as one can tell from where they are.
-    fn may_touch(&self, (a, b): Pair, at_a: &Relative, at_b: &Relative) -> bool {
+    /// How far the two submaps reach into one another, as far as one can tell from where they are: 1 where they are at one
+    /// place, nothing where they do not touch.
+    fn nearness(&self, (a, b): Pair, at_a: &Relative, at_b: &Relative) -> Option<f64> {
         let (at_a, at_b) = (at_a.sim(), at_b.sim());
-        (at_a.translation - at_b.translation).norm() <= at_a.scale * self.reach(a) + at_b.scale * self.reach(b)
+        let apart = (at_a.translation - at_b.translation).norm();
+        let reach = at_a.scale * self.reach(a) + at_b.scale * self.reach(b);
+        (apart <= reach).then(|| if reach > 0.0 { 1.0 - apart / reach } else { 1.0 })
     }
 
     /// How far from its anchor a submap may still overlap another, in its frame's unit: half its extent.

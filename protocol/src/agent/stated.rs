@@ -1,7 +1,7 @@
 //! How much has been stated already of two frames and of their submaps: when one alignment more would say too little.
 
 use super::knowledge::Pair;
-use super::negotiation::{ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP};
+use super::negotiation::ALIGNMENTS_PER_FRAME_PAIR;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use std::collections::BTreeMap;
@@ -32,11 +32,9 @@ impl Stated {
         *self.of_submap.entry((j, i.frame)).or_default() += 1;
     }
 
-    /// One of the submaps has said enough of the other's frame, which is never less than the `alignments_min` that it takes
-    /// to merge.
-    pub(super) fn has_said_enough(&self, (i, j): Pair, alignments_min: usize) -> bool {
-        let most = self.of_submap(i, j.frame).max(self.of_submap(j, i.frame));
-        most >= ALIGNMENTS_PER_SUBMAP.max(alignments_min)
+    /// Alignments that either of two submaps has with the other's frame, of the one that has more.
+    pub(super) fn most_of_either(&self, (i, j): Pair) -> usize {
+        self.of_submap(i, j.frame).max(self.of_submap(j, i.frame))
     }
 
     /// Alignments of a submap with a frame.
@@ -78,18 +76,18 @@ mod tests {
     }
 
     #[test]
-    fn a_submap_has_said_enough_of_one_frame_at_its_limit_and_not_before() {
-        for alignments_min in [1, 3, 5] {
-            let limit = ALIGNMENTS_PER_SUBMAP.max(alignments_min) as u32;
-            let mut stated = Stated::default();
-            for n in 0..limit {
-                assert!(!stated.has_said_enough((submap(1, 0), submap(2, 99)), alignments_min), "{n}");
-                stated.count((submap(1, 0), submap(2, n)), &measured(0.1));
-            }
-            assert!(stated.has_said_enough((submap(1, 0), submap(2, 99)), alignments_min));
-            assert!(!stated.has_said_enough((submap(1, 0), submap(3, 0)), alignments_min), "another frame");
-            assert!(!stated.has_said_enough((submap(1, 1), submap(2, 0)), alignments_min), "another submap");
+    fn what_a_submap_has_said_of_one_frame_is_counted_from_both_its_ends() {
+        let mut stated = Stated::default();
+        let most = |stated: &Stated, i, j| stated.most_of_either((i, j));
+        for n in 0..4 {
+            assert_eq!(most(&stated, submap(1, 0), submap(2, 99)), n);
+            stated.count((submap(1, 0), submap(2, n as u32)), &measured(0.1));
         }
+        assert_eq!(most(&stated, submap(1, 99), submap(2, 3)), 1);
+        assert_eq!(most(&stated, submap(1, 0), submap(3, 0)), 0, "another frame");
+        assert_eq!(most(&stated, submap(1, 1), submap(2, 99)), 0, "another submap");
+        stated.count((submap(1, 0), submap(1, 9)), &measured(0.1));
+        assert_eq!([0, 9].map(|n| most(&stated, submap(1, n), submap(1, 50))), [1, 1], "a loop");
     }
 
     #[test]

@@ -75,6 +75,7 @@ pub fn run(options: &Mission) -> anyhow::Result<bool> {
     let merged = merges(&outcome, &anchors, &mut out)?;
     let accurate = accuracy(&outcome, snapshot, &anchors, &mut out)?;
     let frugal = traffic(&outcome, &mut out)?;
+    work(&outcome, &mut out)?;
     Ok(merged && accurate && frugal)
 }
 
@@ -183,6 +184,26 @@ fn accuracy(
         claimed.1.to_degrees(),
     )?;
     Ok(joined == anchors.len() && ours <= RATIO_MAX * theirs)
+}
+
+/// What aligning took of each robot's computer, and how much of it was in vain.
+fn work(outcome: &Outcome<Agent>, out: &mut impl Write) -> anyhow::Result<()> {
+    let stats = outcome.robots.iter().filter_map(|robot| robot.snapshot.as_ref()).map(|snapshot| &snapshot.stats.work);
+    let done = |kind: &str| stats.clone().filter_map(|work| work.get(kind)).sum::<u64>();
+    let secs = outcome.ended.as_secs_f64() * outcome.usage.len() as f64;
+    let laps = outcome.stopwatch.laps();
+    let share = |kind: &str| 100.0 * laps.iter().filter(|lap| lap.0 == kind).map(|lap| lap.2).sum::<f64>() / secs;
+    writeln!(
+        out,
+        "alignments tried: {}, of which {} came to nothing; of a core each robot took {:.1} % for them, {:.1} % for \
+         describing and {:.1} % for solving",
+        done("align"),
+        done("refused"),
+        share("align"),
+        share("describe"),
+        share("solve")
+    )?;
+    Ok(())
 }
 
 /// What each robot sent.
