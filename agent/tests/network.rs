@@ -150,6 +150,13 @@ async fn the_robots_own_slam_feeds_it_in_json_and_postcard_from_this_host_alone(
     };
     let keyframes = async |robot: &str| view(&session, robot, "status").await.map(|v| v["keyframes"].as_u64().unwrap());
     let message = |index| KeyframeMessage::from(&keyframe(0, index));
+    // What is published while links come up may be lost: until something has arrived.
+    until("the way to alpha", async || {
+        send("alpha", b"hello".to_vec(), "text/plain").await;
+        let stats = view(&session, "alpha", "stats").await;
+        stats.is_some_and(|stats| stats["shell"].to_string().contains("neither application/json nor"))
+    })
+    .await;
 
     for robot in ["beta", "alpha"] {
         send(robot, serde_json::to_vec(&message(0)).unwrap(), "application/json").await;
