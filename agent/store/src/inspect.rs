@@ -113,15 +113,15 @@ enum Trouble {
 fn attempt<T>(work: impl FnOnce() -> Result<T, redb::Error>) -> Result<T, Trouble> {
     match catch_unwind(AssertUnwindSafe(work)) {
         Ok(Ok(value)) => Ok(value),
-        // These two say that the file is shorter than, or not what, it should be.
-        Ok(Err(redb::Error::Io(error)))
-            if !matches!(error.kind(), io::ErrorKind::UnexpectedEof | io::ErrorKind::InvalidData) =>
-        {
-            Err(Trouble::Unreadable(error.to_string()))
-        }
+        Ok(Err(redb::Error::Io(error))) if !tells_of_damage(&error) => Err(Trouble::Unreadable(error.to_string())),
         Ok(Err(error)) => Err(Trouble::Damaged(error.to_string())),
         Err(panic) => Err(Trouble::Damaged(tables::what_panicked(&*panic))),
     }
+}
+
+/// Whether it says that the file is shorter than, or not what, it should be; else the disk may give it later.
+pub(crate) fn tells_of_damage(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::UnexpectedEof | io::ErrorKind::InvalidData)
 }
 
 /// The database's own checksums, over all pages.

@@ -132,7 +132,7 @@ pub(crate) fn open_database(medium: &dyn Medium) -> Result<Database, StoreError>
         DatabaseError::UpgradeRequired(found) => {
             StoreError::Schema { path, found: format!("redb file format {found}") }
         }
-        DatabaseError::Storage(redb::StorageError::Io(error)) if error.kind() != io::ErrorKind::InvalidData => {
+        DatabaseError::Storage(redb::StorageError::Io(error)) if !inspect::tells_of_damage(&error) => {
             StoreError::Failed { path, reason: error.to_string() }
         }
         other => StoreError::NotAStore { path, reason: other.to_string() },

@@ -187,3 +187,23 @@ fn a_disk_that_cannot_be_read_for_a_while_costs_nothing() {
     }
     assert!(refused > 50 && opened > 50, "{refused} refused, {opened} opened");
 }
+
+/// What a power cut leaves on a disk that lied. To wait for such a file to become readable would be to wait for ever.
+#[test]
+fn a_file_cut_short_is_refused_with_the_advice_to_move_it_away() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("s.redb");
+    let medium = FileMedium::new(&path);
+    let mut store = Store::open(medium.clone(), owner(), 1).unwrap().store;
+    for batch in records().chunks(5) {
+        store.commit(batch.iter()).unwrap();
+    }
+    drop(store);
+    let whole = std::fs::read(&path).unwrap();
+    for len in (1..512).step_by(17).chain((512..whole.len()).step_by(whole.len() / 200)) {
+        std::fs::write(&path, &whole[..len]).unwrap();
+        let opened = Store::open(medium.clone(), owner(), 1);
+        assert!(matches!(opened, Err(StoreError::NotAStore { .. })), "{len} of {} bytes: {opened:?}", whole.len());
+        assert_eq!(std::fs::read(&path).unwrap(), whole[..len], "{len}: it was changed");
+    }
+}
