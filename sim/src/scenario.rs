@@ -95,6 +95,8 @@ pub struct SummaryOptions {
     pub reach_m: f64,
     /// Standard deviation of an alignment, m and rad.
     pub sigma: [f64; 2],
+    /// Share of an alignment's variance that all alignments of the one submap have in common, and of the other: 0 to 0.5.
+    pub common: f64,
     /// Whether the joint estimate is solved; else robots believe nothing about one another.
     pub solve: bool,
     /// Robots that state false alignments, each its own falsehood.
@@ -103,7 +105,7 @@ pub struct SummaryOptions {
 
 impl Default for SummaryOptions {
     fn default() -> Self {
-        Self { points: 24, reach_m: 6.0, sigma: [0.02, 0.005], solve: true, liars: Vec::new() }
+        Self { points: 24, reach_m: 6.0, sigma: [0.02, 0.005], common: 0.0, solve: true, liars: Vec::new() }
     }
 }
 
@@ -192,6 +194,7 @@ impl Scenario {
             range("summary.reach_m", summary.reach_m, 0.0, 1e6, "use 0 to 1e6 m")?;
             range("summary.sigma[0]", summary.sigma[0], 1e-6, 10.0, "use 1e-6 to 10 m")?;
             range("summary.sigma[1]", summary.sigma[1], 1e-6, 1.0, "use 1e-6 to 1 rad")?;
+            range("summary.common", summary.common, 0.0, 0.5, "use 0 to 0.5")?;
             summary.liars.iter().try_for_each(|liar| self.validate_name("summary.liars", liar))?;
         }
         range("expect.error_max_m", self.expect.error_max_m, 1e-6, 1e6, "use a positive length")?;

@@ -56,6 +56,14 @@ fn error(own: &str, frame: &str, relation: &RelationView, truth: &Se3) -> FrameE
     FrameError { own: own.to_owned(), frame: frame.to_owned(), metres, degrees, scale: relation.pose.scale, d2 }
 }
 
+/// `δᵀ P⁻¹ δ` of a rigid relation's error; `None` for similarities, infinite for what is none.
+pub fn nees(relation: &RelationView, truth: &Se3) -> Option<f64> {
+    match rigid(&relation.pose) {
+        None => Some(f64::INFINITY),
+        Some(estimate) => normalised(relation, &estimate.local(truth)),
+    }
+}
+
 /// `None` unless the covariance is that of a rigid motion; infinite if it is no covariance.
 fn normalised(relation: &RelationView, delta: &Vector6<f64>) -> Option<f64> {
     (relation.covariance.len() == 21).then(|| {

@@ -1,5 +1,7 @@
 //! `merganser-sim bench`: how good and how fast the estimators are, as tables (MATH §4 and §5).
 
+mod anchors;
+pub mod calibration;
 pub mod corr;
 pub mod cpu;
 mod fit;
@@ -62,6 +64,11 @@ pub enum Bench {
     /// see the same take more than 60 s to merge, the map errs by more than 1.1 times that of a solver given every true
     /// loop, or a robot sends more than 1 kB/s.
     Mission(mission::Mission),
+    /// Whether frames, submaps and live poses of simulated swarms are as uncertain as they say
+    ///
+    /// Alignments are made up, and err as much as they say. Exit code 1 if a mean normalised error lies outside of 0.93 to
+    /// 1.07 times its degrees of freedom.
+    Calibration(calibration::Calibration),
     /// Frame-level consensus on seeded worlds: success, refusals and honesty of the covariance
     ///
     /// Two robots drive a figure-eight of about 120 m with drifting odometry; a cell has 20 alignments between them, of
@@ -89,6 +96,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Share(options) => share::run(&options),
         Bench::Flood(options) => flood::run(&options),
         Bench::Mission(options) => mission::run(&options),
+        Bench::Calibration(options) => calibration::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }
 }

@@ -9,7 +9,7 @@ use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3
 use merganser_protocol::ids::Hash;
 use merganser_protocol::submap::Submap;
 use merganser_protocol::wire::fact::RefusalReason;
-use nalgebra::Vector6;
+use nalgebra::{Matrix6, Vector6};
 use std::collections::BTreeMap;
 
 /// Where described submaps truly lie, by what was described.
@@ -17,14 +17,21 @@ use std::collections::BTreeMap;
 pub struct StandIn {
     options: SummaryOptions,
     seed: u64,
-    /// `t_world_anchor` by the hash of features and of keypoints.
-    anchors: BTreeMap<Hash, Se3>,
+    /// By the hash of features and of keypoints.
+    places: BTreeMap<Hash, Place>,
+}
+
+/// Where a submap truly lies, and what all its alignments err by alike, in standard deviations of one.
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    t_world_anchor: Se3,
+    bent: Vector6<f64>,
 }
 
 impl StandIn {
     /// Knows nothing yet.
     pub fn new(options: SummaryOptions, seed: u64) -> Self {
-        Self { options, seed, anchors: BTreeMap::new() }
+        Self { options, seed, places: BTreeMap::new() }
     }
 
     /// Does a job of the robot called `name`. `locate` says where the keyframe truly was that a submap's anchor names.
@@ -35,8 +42,11 @@ impl StandIn {
                 let t_world_anchor = locate(&job.submap);
                 let result = Job::Describe(job).run();
                 if let (JobResult::Described(described), Some(t_world_anchor)) = (&result, t_world_anchor) {
-                    self.anchors.insert(Hash::of(&described.1.features.encode()), t_world_anchor);
-                    self.anchors.insert(Hash::of(&described.1.keypoints.encode()), t_world_anchor);
+                    let features = Hash::of(&described.1.features.encode());
+                    let mut dice = Dice::new(self.seed, &format!("bent {features}"));
+                    let place = Place { t_world_anchor, bent: Vector6::from_fn(|_, _| dice.normal()) };
+                    self.places.insert(features, place);
+                    self.places.insert(Hash::of(&described.1.keypoints.encode()), place);
                 }
                 (result, false)
             }
@@ -57,23 +67,35 @@ impl StandIn {
         if job.theirs.is_empty() || job.mine.is_empty() {
             return Err(RefusalReason::NoConsensus);
         }
-        let theirs = self.anchors.get(&Hash::of(&job.theirs.encode())).ok_or(RefusalReason::BadInput)?;
-        let mine = self.anchors.get(&Hash::of(&job.mine.encode())).ok_or(RefusalReason::BadInput)?;
-        let truth = mine.inverse() * *theirs;
+        let theirs = self.places.get(&Hash::of(&job.theirs.encode())).ok_or(RefusalReason::BadInput)?;
+        let mine = self.places.get(&Hash::of(&job.mine.encode())).ok_or(RefusalReason::BadInput)?;
+        let truth = mine.t_world_anchor.inverse() * theirs.t_world_anchor;
         if truth.translation.norm() > self.options.reach_m {
             return Err(RefusalReason::NoConsensus);
         }
         let mut dice = Dice::new(self.seed, &format!("align {}", job.seed));
         let [t, r] = self.options.sigma;
-        let sigmas = [t, t, t, r, r, r];
-        let noise = Vector6::from(sigmas.map(|sigma| sigma * dice.normal()));
-        let mut pose = truth.retract(&noise);
+        let sigmas = Vector6::from([t, t, t, r, r, r]);
+        let noise = sigmas.map(|sigma| sigma * dice.normal());
+        let (mut pose, covariance) = match self.options.common {
+            0.0 => (truth.retract(&noise), Covariance::from_sigmas(sigmas.into())),
+            common => {
+                let bent = |place: &Place| Se3::exp(&(place.bent.component_mul(&sigmas) * common.sqrt()));
+                let own = noise * (1.0 - 2.0 * common).sqrt();
+                let pose = bent(mine).inverse() * truth * bent(theirs) * Se3::exp(&own);
+                let variance = Matrix6::from_diagonal(&sigmas.component_mul(&sigmas));
+                // What bends mine moves theirs by the lever between them.
+                let lever = truth.inverse().adjoint();
+                let sum = lever * variance * lever.transpose() * common + variance * (1.0 - common);
+                (pose, Covariance::new(sum))
+            }
+        };
         if lies {
             let mut dice = Dice::new(self.seed, &format!("lie {name}"));
             let falsehood = Vector6::from([4.0, 4.0, 0.0, 0.0, 0.0, 1.5].map(|size| size * dice.range(0.5, 1.0)));
             pose = pose * Se3::exp(&falsehood);
         }
-        let covariance = Covariance::from_sigmas(sigmas).map_err(|_| RefusalReason::BadInput)?;
+        let covariance = covariance.map_err(|_| RefusalReason::BadInput)?;
         let t_mine_theirs = Relative::Metric(PoseWithCovariance { pose, covariance });
         Ok(Measured { t_mine_theirs, sigma: t, support: 40.0, log10_nfa: -20.0 })
     }
@@ -107,25 +129,62 @@ mod tests {
         }
     }
 
+    fn align(
+        standin: &mut StandIn,
+        mine: &Described,
+        theirs: &Described,
+        seed: u64,
+    ) -> Result<Box<Measured>, RefusalReason> {
+        let job = AlignJob {
+            theirs: Arc::new(theirs.keypoints.clone()),
+            mine: Arc::new(mine.features.clone()),
+            back: None,
+            config: AlignConfig::default(),
+            voxel_m: 0.1,
+            sensor: Sensor::Points3d,
+            scale: ScaleKind::Metric,
+            seed,
+        };
+        match standin.run("alpha", Job::Align(Box::new(job)), |_| None).0 {
+            JobResult::Aligned(answer) => answer,
+            other => panic!("{other:?}"),
+        }
+    }
+
     #[test]
     fn submaps_without_keypoints_align_with_nothing() {
         for (points, aligned) in [(1, false), (400, true)] {
             let mut standin = StandIn::new(SummaryOptions::default(), 1);
             let [mine, theirs] = [0.0, 2.0].map(|x| described(&mut standin, points, x));
-            let job = AlignJob {
-                theirs: Arc::new(theirs.keypoints),
-                mine: Arc::new(mine.features),
-                back: None,
-                config: AlignConfig::default(),
-                voxel_m: 0.1,
-                sensor: Sensor::Points3d,
-                scale: ScaleKind::Metric,
-                seed: 1,
-            };
-            let JobResult::Aligned(answer) = standin.run("alpha", Job::Align(Box::new(job)), |_| None).0 else {
-                panic!("not aligned")
-            };
-            assert_eq!(answer.is_ok(), aligned, "{points} points");
+            assert_eq!(align(&mut standin, &mine, &theirs, 1).is_ok(), aligned, "{points} points");
+        }
+    }
+
+    /// Alignments of one submap err alike, by the stated share, and as much as they say.
+    #[test]
+    fn errors_are_as_large_and_as_much_alike_as_stated() {
+        for common in [0.0, 0.2, 0.5] {
+            let (mut nees, mut alike) = (0.0, 0.0);
+            let runs = 400;
+            for seed in 0..runs {
+                let options = SummaryOptions { common, ..SummaryOptions::default() };
+                let mut standin = StandIn::new(options, seed);
+                let [one, two, three] = [0.0, 2.0, 4.0].map(|x| described(&mut standin, 100, x));
+                let mut whitened = |mine: &Described, x: f64, seed| {
+                    let t = align(&mut standin, mine, &two, seed).unwrap().t_mine_theirs;
+                    let t = t.metric().unwrap();
+                    let truth = Se3::new(Se3::identity().rotation, [x, 0.0, 0.0].into());
+                    let off = truth.local(&t.pose);
+                    nees += t.covariance.mahalanobis_squared(&off) / 2.0;
+                    // Rotations: no lever turns these.
+                    off.fixed_rows::<3>(3) / 0.005
+                };
+                let (a, b) = (whitened(&one, 2.0, 7), whitened(&three, -2.0, 8));
+                alike += a.dot(&b) / 3.0;
+            }
+            let (nees, alike) = (nees / runs as f64, alike / runs as f64);
+            assert!((nees - 6.0).abs() < 0.6, "{common}: NEES {nees}");
+            assert!((alike - common).abs() < 0.12, "{common}: {alike}");
         }
     }
 }

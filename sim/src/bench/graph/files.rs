@@ -35,6 +35,11 @@ impl Source {
         Ok(parser.finish())
     }
 
+    /// Whether [`Source::truth`] may know where its robots truly were.
+    pub(super) fn has_truth(&self) -> bool {
+        self.closures.is_some()
+    }
+
     /// Where the robots truly were, where a file tells (Kollagen's `*_GT.tum` beside each robot's graph, a line a pose).
     pub(super) fn truth(&self) -> anyhow::Result<BTreeMap<u64, Se3>> {
         let mut out = BTreeMap::new();

@@ -207,5 +207,5 @@ pub(super) fn table(percent: u32, seed: u64, rows: &[Spoiled]) -> String {
     }
     text + "precision, recall: of closures between robots that count in the estimate; ATE: RMS distance of all poses from \
             the unspoiled graph's; told: of the solution from the true closures alone; ANEES: of our poses against the \
-            truth, where it is known, by degrees of freedom; peers start where PCM lays the robots out\n"
+            truth, where it is known, by degrees of freedom (--draws tells what is usual); peers start where PCM lays the robots out\n"
 }

@@ -2,14 +2,13 @@
 //! merge that see the same, how far off is the map at the end beside that of a solver who is given every true loop, and
 //! what does each robot send for it?
 
-mod anchors;
 mod oracle;
 
 use crate::bar::progress_bar;
+use crate::bench::anchors::{Anchor, anchors, errors};
 use crate::bench::table::median;
 use crate::scenario::Scenario;
 use crate::swarm::{Outcome, Swarm};
-use anchors::{Anchor, anchors, errors};
 use anyhow::{Context, ensure};
 use clap::Args;
 use merganser_protocol::agent::Agent;
@@ -148,7 +147,7 @@ fn accuracy(
 ) -> anyhow::Result<bool> {
     let joined = anchors.iter().filter(|anchor| anchor.t_own_anchor.is_some()).count();
     ensure!(joined > 0, "no submap is in the map");
-    let ours = errors(anchors, |anchor| anchor.t_own_anchor);
+    let ours = errors(anchors, Anchor::estimated);
     let of_alignments = oracle::alignment_errors(snapshot, anchors).context("no alignment is used")?;
     let (sigmas, claimed) = (of_alignments.true_ones, of_alignments.claimed);
     let loops = oracle::loops(anchors, OVERLAP_M);

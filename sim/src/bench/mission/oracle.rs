@@ -1,7 +1,7 @@
 //! The solver that is given every true loop: the same odometry, and between any two submaps that overlap an alignment with
 //! errors like those of the swarm's own.
 
-use super::anchors::Anchor;
+use crate::bench::anchors::Anchor;
 use crate::dice::Dice;
 use crate::swarm::Outcome;
 use crate::truth::{rigid, square};

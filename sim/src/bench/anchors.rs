@@ -6,7 +6,7 @@ use crate::truth::rigid;
 use anyhow::{Context, ensure};
 use merganser_protocol::agent::Agent;
 use merganser_protocol::geometry::Se3;
-use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::snapshot::{RelationView, Snapshot};
 use nalgebra::Vector3;
 
 /// A submap's anchor was a keyframe: nothing else lies so near by odometry, m.
@@ -26,10 +26,15 @@ pub(super) struct Anchor {
     /// By odometry alone.
     pub(super) t_frame_anchor: Se3,
     /// By the joint estimate of the first robot.
-    pub(super) t_own_anchor: Option<Se3>,
+    pub(super) t_own_anchor: Option<RelationView>,
 }
 
 impl Anchor {
+    /// By the joint estimate of the first robot, without its covariance.
+    pub(super) fn estimated(&self) -> Option<Se3> {
+        rigid(&self.t_own_anchor.as_ref()?.pose)
+    }
+
     pub(super) fn is_near(&self, other: &Self, metres: f64) -> bool {
         (self.t_world_anchor.translation - other.t_world_anchor.translation).norm_squared() <= metres * metres
     }
@@ -56,7 +61,7 @@ pub(super) fn anchors(outcome: &Outcome<Agent>, snapshot: &Snapshot) -> anyhow::
             step,
             t_world_anchor: outcome.stage.steps(robot)[step].t_world_body,
             t_frame_anchor,
-            t_own_anchor: view.t_own_anchor.as_ref().and_then(|relation| rigid(&relation.pose)),
+            t_own_anchor: view.t_own_anchor.clone(),
         });
     }
     all.sort_by_key(|anchor| (anchor.robot, anchor.index));
