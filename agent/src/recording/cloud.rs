@@ -54,6 +54,11 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
     Ok(bytes)
 }
 
+/// The whole file as text, if it is not larger than [`CLOUD_BYTES_MAX`].
+pub(super) fn read_text(path: &Path) -> Result<String, RecordingError> {
+    String::from_utf8(read_bytes(path)?).map_err(|_| Problem::Data("is no text".into()).of(path))
+}
+
 fn parse(bytes: &[u8], format: CloudFormat) -> Result<Vec<[f32; 3]>, Fault> {
     let points = match format {
         CloudFormat::Ply => ply::parse(bytes)?,

@@ -89,7 +89,7 @@ fn numbered(data: &Path, format: CloudFormat) -> Result<Vec<u32>, RecordingError
 
 /// `t_world_lidar` by the scan's number.
 fn read_poses(path: &Path) -> Result<BTreeMap<u32, Se3>, RecordingError> {
-    let text = on(path, std::fs::read_to_string(path))?;
+    let text = cloud::read_text(path)?;
     let mut poses = BTreeMap::new();
     for (index, line) in text.lines().enumerate() {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();

@@ -3,7 +3,7 @@
 //! camera: x right, y down, z forward. Depth from 0.3 to 4 m, every sixth pixel of every sixth row: up to 8,500 points.
 
 use super::Drift;
-use super::cloud::read_bytes;
+use super::cloud::{read_bytes, read_text};
 use super::error::{Problem, RecordingError, on};
 use super::import::{Cut, Scan};
 use super::table::{near, number};
@@ -26,6 +26,8 @@ const DEPTH_MM: std::ops::RangeInclusive<u16> = 300..=4000;
 const PIXELS_MAX: u64 = 1 << 24;
 /// Every so many pixels of every so many rows.
 const STRIDE: usize = 6;
+/// A camera's focal length by the width, or height, of its image: from a fish eye to a telescope.
+const FOCAL_BY_SIZE: std::ops::RangeInclusive<f64> = 0.1..=10.0;
 /// The camera's rate.
 const FRAME_NANOS: i64 = 1_000_000_000 / 30;
 /// A hand-held visual SLAM's: 1 % of the way and a tenth of a degree on each axis per keyframe (a third of a second).
@@ -70,8 +72,16 @@ struct Camera {
     cy: f64,
 }
 
+impl Camera {
+    /// Whether it can have taken an image of so many pixels.
+    fn takes(&self, width: f64, height: f64) -> bool {
+        let one = |f: f64, c: f64, size: f64| FOCAL_BY_SIZE.contains(&(f / size)) && (0.0..=size).contains(&c);
+        one(self.fx, self.cx, width) && one(self.fy, self.cy, height)
+    }
+}
+
 fn read_intrinsics(path: &Path) -> Result<Camera, RecordingError> {
-    let text = on(path, std::fs::read_to_string(path))?;
+    let text = read_text(path)?;
     let mut k = Vec::new();
     for (index, line) in text.lines().enumerate() {
         for word in line.split_ascii_whitespace() {
@@ -86,7 +96,7 @@ fn read_intrinsics(path: &Path) -> Result<Camera, RecordingError> {
 
 /// `index` and sixteen numbers a line: the camera-to-world matrix, row by row.
 fn read_poses(path: &Path) -> Result<BTreeMap<u32, Se3>, RecordingError> {
-    let text = on(path, std::fs::read_to_string(path))?;
+    let text = read_text(path)?;
     let mut poses = BTreeMap::new();
     for (index, line) in text.lines().enumerate() {
         let pose = read_pose(line).map_err(|problem| problem.at(path, index + 1))?;
@@ -134,6 +144,15 @@ fn read_depth(path: &Path, camera: &Camera) -> Result<Vec<[f32; 3]>, RecordingEr
     let Some(size) = size else {
         return Err(Problem::Image(format!("a depth image is 16-bit grey, not {kind:?}")).of(path));
     };
+    let Camera { fx, fy, cx, cy } = *camera;
+    let height = reader.info().height as usize;
+    if !camera.takes(width as f64, height as f64) {
+        let why = format!(
+            "no camera of focal lengths {fx} and {fy} and principal point {cx}, {cy} takes an image of {width} × {height} \
+             pixels; check {INTRINSICS}"
+        );
+        return Err(Problem::Image(why).of(path));
+    }
     let mut pixels = vec![0; size];
     reader.next_frame(&mut pixels).map_err(told)?;
     let (pixels, _) = pixels.as_chunks::<2>();
@@ -143,7 +162,7 @@ fn read_depth(path: &Path, camera: &Camera) -> Result<Vec<[f32; 3]>, RecordingEr
             let depth = u16::from_be_bytes(*pixel);
             if DEPTH_MM.contains(&depth) {
                 let z = f64::from(depth) * 1e-3;
-                let (x, y) = ((u as f64 - camera.cx) / camera.fx * z, (v as f64 - camera.cy) / camera.fy * z);
+                let (x, y) = ((u as f64 - cx) / fx * z, (v as f64 - cy) / fy * z);
                 points.push([x as f32, y as f32, z as f32]);
             }
         }

@@ -187,4 +187,6 @@ fn read_truth(path: &Path, keyframes: &[KeyframeLine]) -> Result<Vec<TruthLine>,
 }
 
 #[cfg(test)]
+mod import_tests;
+#[cfg(test)]
 mod tests;
