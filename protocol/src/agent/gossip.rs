@@ -6,6 +6,7 @@ use super::Agent;
 use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
 use super::knowledge::{Pair, pair_of};
 use super::ledger::BATCHES_WAITING_MAX;
+use super::sighting::Twist;
 use super::traffic::{Traffic, is_piece};
 use crate::config::GossipConfig;
 use crate::gossip::{Answer, Class, Spread, Step};
@@ -40,6 +41,26 @@ pub(super) struct Gossip {
 pub(super) struct SeenBeacon {
     pub(super) content: BeaconContent,
     pub(super) at: Instant,
+    /// When the first one with this stamp was heard: the robot may have moved since, and had no keyframe.
+    pub(super) since: Instant,
+    /// How the body moves, as far as this one and those before it tell.
+    pub(super) twist: Option<Twist>,
+}
+
+impl SeenBeacon {
+    fn after(before: Option<&Self>, content: BeaconContent, at: Instant) -> Self {
+        let Some(Self { content: old, since, twist, .. }) = before else {
+            return Self { content, at, since: at, twist: None };
+        };
+        if old.anchor.frame != content.anchor.frame {
+            return Self { content, at, since: at, twist: None };
+        }
+        // A body is told relative to its anchor, and what lies between two anchors is not asked here.
+        let secs = content.stamp.secs_since(old.stamp);
+        let told = Twist::between(&old.t_anchor_body.pose, &content.t_anchor_body.pose, secs);
+        let twist = told.filter(|_| old.anchor == content.anchor).or(*twist);
+        Self { content, at, since: if content.stamp == old.stamp { *since } else { at }, twist }
+    }
 }
 
 /// A question of ours under way.
@@ -227,7 +248,8 @@ impl Agent {
             age(beacon) > age(&seen.content)
         });
         if newer && robot != self.me.robot {
-            self.gossip.beacons.insert(robot, SeenBeacon { content: **beacon, at: self.now });
+            let seen = SeenBeacon::after(self.gossip.beacons.get(&robot), **beacon, self.now);
+            self.gossip.beacons.insert(robot, seen);
         }
     }
 

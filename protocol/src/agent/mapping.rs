@@ -1,17 +1,16 @@
 //! The robot's own side: keyframes in, submaps cut, described one at a time, and stated as facts in order.
 
 use super::Agent;
-use super::io::{Event, JobId, Record, Sighting};
+use super::io::{Event, JobId, Record};
 use super::job::{DescribeJob, Job};
-use super::ledger::BATCHES_WAITING_MAX;
+use super::sighting::Twist;
 use crate::config::SubmapConfig;
-use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use crate::geometry::{PoseWithCovariance, Se3};
 use crate::ids::{Hash, SubmapId};
 use crate::submap::{Described, Features, Keyframe, KeyframeError, Keypoints, Submap, SubmapBuilder};
 use crate::time::{Instant, Stamp};
-use crate::wire::fact::{Fact, SightingFact, SubmapFact};
+use crate::wire::fact::{Fact, SubmapFact};
 use core::time::Duration;
-use nalgebra::{Matrix6, Vector3};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -27,6 +26,8 @@ const CLOCK_BACK: Duration = Duration::from_secs(10);
 pub(super) struct Mapper {
     builder: SubmapBuilder,
     behind: Option<Behind>,
+    last: Option<(Se3, Stamp)>,
+    twist: Option<Twist>,
     queue: VecDeque<(SubmapId, Submap)>,
     describing: Option<(JobId, SubmapId)>,
     pub(super) keyframes: u64,
@@ -43,13 +44,19 @@ struct Behind {
 impl Mapper {
     pub(super) fn new(config: &SubmapConfig) -> Self {
         let builder = SubmapBuilder::new(config.clone());
-        Self { builder, behind: None, queue: VecDeque::new(), describing: None, keyframes: 0 }
+        Self { builder, behind: None, last: None, twist: None, queue: VecDeque::new(), describing: None, keyframes: 0 }
     }
 
     /// A new frame: what follows has nothing to do with what came before.
     pub(super) fn restart(&mut self, config: &SubmapConfig) {
         self.builder = SubmapBuilder::new(config.clone());
         self.behind = None;
+        (self.last, self.twist) = (None, None);
+    }
+
+    fn taken(&mut self, pose: &Se3, stamp: Stamp) {
+        let last = self.last.replace((*pose, stamp));
+        self.twist = last.and_then(|(last, at)| Twist::between(&last, pose, stamp.secs_since(at)));
     }
 
     /// A keyframe with this stamp was refused as one behind. Whether the clock has gone back for good.
@@ -65,6 +72,11 @@ impl Mapper {
     /// Submaps not yet described.
     pub(super) fn pending(&self) -> usize {
         self.queue.len() + usize::from(self.describing.is_some())
+    }
+
+    /// How the body moved between its last two keyframes.
+    pub(super) fn twist(&self) -> Option<Twist> {
+        self.twist
     }
 
     /// The last finished submap and the body's pose in its anchor.
@@ -83,10 +95,11 @@ impl Agent {
             self.reject(Some(self.me.robot), "keyframe: overload", &detail);
             return;
         }
-        let stamp = keyframe.stamp;
+        let (stamp, pose) = (keyframe.stamp, keyframe.pose.pose);
         match self.mapper.builder.push(keyframe) {
             Ok(closed) => {
                 self.mapper.behind = None;
+                self.mapper.taken(&pose, stamp);
                 self.mapper.keyframes += 1;
                 self.enqueue(closed);
             }
@@ -192,53 +205,4 @@ impl Agent {
             }
         }
     }
-
-    /// A direct measurement of another robot, carried from the two bodies to the anchors they are known by.
-    pub(super) fn on_sighting(&mut self, sighting: &Sighting) {
-        if self.is_receive_only() {
-            return self.reject(Some(self.me.robot), "sighting: receive-only", "it cannot be kept now");
-        }
-        if self.is_overloaded() {
-            let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk; the store is too slow");
-            return self.reject(Some(self.me.robot), "sighting: overload", &detail);
-        }
-        match self.sighting_fact(sighting) {
-            Ok(fact) => _ = self.write(self.me.frame.epoch, &Fact::Sighting(fact)),
-            Err(detail) => self.reject(Some(self.me.robot), "sighting", detail),
-        }
-    }
-
-    fn sighting_fact(&self, sighting: &Sighting) -> Result<SightingFact, &'static str> {
-        let t_body_other = parse_sighting(sighting)?;
-        let seen = self.replica.members().find(|(_, name)| **name == sighting.robot).map(|(id, _)| id);
-        let seen = seen.filter(|id| *id != self.me.robot).ok_or("names no other robot of the roster")?;
-        let (index, t_i_body, _) = self.mapper.body().ok_or("came before the first submap was finished")?;
-        let beacon = self
-            .gossip
-            .beacon(seen)
-            .map(|seen| &seen.content)
-            .ok_or("names a robot of which no pose beacon was heard yet")?;
-        let t_i_j = t_i_body.compose(&t_body_other).compose(&beacon.t_anchor_body.inverse());
-        let i = SubmapId { frame: self.me.frame, index };
-        Ok(SightingFact { stamp: sighting.stamp, i, j: beacon.anchor, t_i_j })
-    }
-}
-
-fn parse_sighting(sighting: &Sighting) -> Result<PoseWithCovariance, &'static str> {
-    let [x, y, z, qx, qy, qz, qw] = sighting.t_body_other;
-    let translation = Vector3::new(x, y, z);
-    if translation.iter().any(|v| !v.is_finite()) {
-        return Err("has a translation that is not finite");
-    }
-    let rotation = So3::from_xyzw([qx, qy, qz, qw]).ok_or("has a quaternion of zero length or not finite")?;
-    let mut p = Matrix6::zeros();
-    let mut upper = sighting.covariance.iter();
-    for r in 0..6 {
-        for c in r..6 {
-            let v = upper.next().copied().unwrap_or(f64::NAN);
-            (p[(r, c)], p[(c, r)]) = (v, v);
-        }
-    }
-    let covariance = Covariance::new(p).map_err(|_| "has a covariance that is not positive definite")?;
-    Ok(PoseWithCovariance { pose: Se3::new(rotation, translation), covariance })
 }

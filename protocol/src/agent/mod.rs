@@ -23,6 +23,7 @@ mod mapping;
 mod negotiation;
 mod ranking;
 mod shortlist;
+mod sighting;
 mod solving;
 mod stated;
 mod stats;
@@ -61,6 +62,7 @@ pub use mapping::CLOCK_BACK_KEYFRAMES;
 pub use negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP,
 };
+pub use sighting::SIGHTING_AGE_SECS_MAX;
 pub use traffic::{POSTPONED_MAX, UNSENT_MAX};
 
 /// A clock that shows more (after 292 years, or because it is broken) stands still for the agent: pauses must end after

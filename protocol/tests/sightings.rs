@@ -1,0 +1,159 @@
+//! What one robot sees of another is carried to anchors with an uncertainty that it can stand by, though both moved on
+//! since the last keyframe and the last beacon.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "a failed unwrap in a test is its report")]
+
+mod common;
+
+use common::{Wires, World, agent, drive, name};
+use merganser_protocol::agent::io::{Input, Sighting};
+use merganser_protocol::agent::{Restored, SIGHTING_AGE_SECS_MAX};
+use merganser_protocol::geometry::{Covariance, Se3};
+use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::submap::Keyframe;
+use merganser_protocol::time::{Instant, Stamp};
+use nalgebra::{SMatrix, Vector6};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::time::Duration;
+
+const KEYFRAMES: usize = 40;
+const SIGMAS: [f64; 6] = [0.05, 0.05, 0.05, 0.02, 0.02, 0.02];
+
+/// Two robots that drive, and where they truly are.
+struct Drive {
+    wires: Wires,
+    keyframes: [Vec<Keyframe>; 2],
+    truth: [Vec<Se3>; 2],
+}
+
+/// The drive until half of it, and the same way back: a robot that stops and turns where none can foresee it.
+fn turned_back(keyframes: &[Keyframe], truth: &[Se3]) -> (Vec<Keyframe>, Vec<Se3>) {
+    let there = |n: usize| if n <= KEYFRAMES / 2 { n } else { KEYFRAMES - n };
+    let at = |n: usize| Keyframe { stamp: keyframes[n].stamp, ..keyframes[there(n)].clone() };
+    ((0..KEYFRAMES).map(at).collect(), (0..KEYFRAMES).map(|n| truth[there(n)]).collect())
+}
+
+impl Drive {
+    fn new() -> Self {
+        let world = World::new(5);
+        let [(a, true_a), (b, true_b)] = [0, 1].map(|k| drive(&world, k, KEYFRAMES));
+        let (b, true_b) = turned_back(&b, &true_b);
+        let wires = Wires::new((0..2).map(|k| agent(k, Restored::default())).collect());
+        Self { wires, keyframes: [a, b], truth: [true_a, true_b] }
+    }
+
+    /// Keyframe `n` of both, one after the other, and a second passes.
+    fn second(&mut self, n: usize, mut meanwhile: impl FnMut(&mut Self, f64)) {
+        for k in [0, 1] {
+            self.wires.input(k, Input::Keyframe(self.keyframes[k][n].clone()));
+        }
+        for tenth in 1..=10 {
+            self.wires.run(Duration::from_millis(100));
+            meanwhile(self, n as f64 + 0.1 * f64::from(tenth));
+        }
+    }
+
+    /// Where robot `k` is at a moment: between two keyframes it moves evenly.
+    fn at(&self, k: usize, secs: f64) -> Se3 {
+        let n = (secs.floor() as usize).min(KEYFRAMES - 2);
+        let (from, to) = (self.truth[k][n], self.truth[k][n + 1]);
+        from * Se3::exp(&((from.inverse() * to).log() * (secs - n as f64)))
+    }
+
+    /// The true pose of an anchor, which was a keyframe.
+    fn anchor(&self, snapshot: &Snapshot, named: &str) -> Se3 {
+        let view = snapshot.map.submaps.iter().find(|s| format!("{}#{}", s.frame, s.index) == named).unwrap();
+        let k = usize::from(view.robot == "beta");
+        let place = nalgebra::Vector3::from(view.t_frame_anchor.translation);
+        let off = |n: &usize| (self.keyframes[k][*n].pose.pose.translation - place).norm();
+        let n = (0..KEYFRAMES).min_by(|a, b| off(a).total_cmp(&off(b))).unwrap();
+        assert!(off(&n) < 1e-3);
+        self.truth[k][n]
+    }
+
+    /// Alpha sees beta with the noise it states.
+    fn sees(&mut self, secs: f64, rng: &mut ChaCha8Rng) {
+        let noise =
+            Vector6::from(SIGMAS.map(|s| s * (0..12).map(|_| rng.random_range(0.0..1.0)).sum::<f64>() - 6.0 * s));
+        let t = (self.at(0, secs).inverse() * self.at(1, secs)).retract(&noise);
+        let [x, y, z, w] = t.rotation.xyzw();
+        let matrix = *Covariance::from_sigmas(SIGMAS).unwrap().matrix();
+        let mut upper = (0..6).flat_map(|r| (r..6).map(move |c| (r, c)));
+        let sighting = Sighting {
+            stamp: Stamp((secs * 1e9) as i64),
+            robot: name(1),
+            t_body_other: [t.translation.x, t.translation.y, t.translation.z, x, y, z, w],
+            covariance: core::array::from_fn(|_| matrix[upper.next().unwrap()]),
+        };
+        self.wires.input(0, Input::Sighting(sighting));
+    }
+
+    fn refused(&self) -> u64 {
+        self.snapshot().stats.rejected.get("sighting").copied().unwrap_or(0)
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        self.wires.agents[0].snapshot(self.wires.now)
+    }
+}
+
+#[test]
+fn a_sighting_is_as_uncertain_as_what_moved_since() {
+    let mut drive = Drive::new();
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    for n in 0..KEYFRAMES - 1 {
+        drive.second(n, |drive, secs| {
+            // At every phase between keyframes.
+            if n > 12 && ((secs * 10.0).round() as usize).is_multiple_of(7) {
+                drive.sees(secs, &mut rng);
+            }
+        });
+    }
+    drive.wires.run(Duration::from_secs(3));
+    let snapshot = drive.snapshot();
+    let seen: Vec<_> = snapshot.graph.edges.iter().filter(|edge| edge.kind == "sighting").collect();
+    assert!(seen.len() > 30, "{} of {} sightings", seen.len(), drive.refused());
+    let (mut nees, mut naive) = (0.0, 0.0);
+    for edge in &seen {
+        let truth = drive.anchor(&snapshot, &edge.i).inverse() * drive.anchor(&snapshot, &edge.j);
+        let [x, y, z, w] = edge.t_i_j.pose.rotation;
+        let rotation = merganser_protocol::geometry::So3::from_xyzw([x, y, z, w]).unwrap();
+        let error = Se3::new(rotation, edge.t_i_j.pose.translation.into()).local(&truth);
+        let mut upper = edge.t_i_j.covariance.iter();
+        let mut covariance = SMatrix::<f64, 6, 6>::zeros();
+        for r in 0..6 {
+            for c in r..6 {
+                let v = *upper.next().unwrap();
+                (covariance[(r, c)], covariance[(c, r)]) = (v, v);
+            }
+        }
+        nees += Covariance::new(covariance).unwrap().mahalanobis_squared(&error) / seen.len() as f64;
+        // As if nobody had moved.
+        naive += Covariance::from_sigmas(SIGMAS).unwrap().mahalanobis_squared(&error) / seen.len() as f64;
+    }
+    println!("{} sightings, NEES {nees:.2} of 6; of the measurement alone {naive:.0}", seen.len());
+    assert!(nees < 7.0, "NEES {nees}");
+    assert!(naive > 12.0, "nothing moved: {naive}");
+}
+
+#[test]
+fn a_sighting_far_in_time_from_what_is_known_of_either_robot_is_refused() {
+    let mut drive = Drive::new();
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    for n in 0..20 {
+        drive.second(n, |_, _| {});
+    }
+    let last = 19.0;
+    drive.sees(last + SIGHTING_AGE_SECS_MAX - 0.1, &mut rng);
+    assert_eq!(drive.refused(), 0);
+    drive.sees(last + SIGHTING_AGE_SECS_MAX + 0.1, &mut rng);
+    drive.sees(last - SIGHTING_AGE_SECS_MAX - 0.1, &mut rng);
+    assert_eq!(drive.refused(), 2);
+    // Alpha drives on, and nothing is heard of beta.
+    let silent = drive.wires.now;
+    drive.wires.agents.truncate(1);
+    drive.wires.run(Duration::from_secs_f64(SIGHTING_AGE_SECS_MAX + 1.0));
+    assert!(drive.wires.now > silent && drive.wires.now > Instant::ZERO);
+    drive.sees(last, &mut rng);
+    assert_eq!(drive.refused(), 3);
+}
