@@ -156,6 +156,10 @@ impl Inspection {
         let (schema, trouble) = match meta(db, tables::META_SCHEMA) {
             Ok(Some(schema)) => match number(&schema) {
                 Some(version) => (Schema::Version(version), None),
+                // No version writes anything but a number there. Where the owner is sealed as we seal, it is damage.
+                None if self.sealed_meta(db, SCHEMA, tables::META_OWNER).is_some() => {
+                    (Schema::Version(SCHEMA), Some(Trouble::Damaged("is no number".into())))
+                }
                 None => (Schema::Unknown("of unknown form".into()), None),
             },
             // No number, but tables: what is sealed says by itself which schema it has.

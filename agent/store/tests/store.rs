@@ -106,11 +106,10 @@ fn a_later_schema_is_refused_and_left_alone() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("s.redb");
     drop(open(&path, 1).unwrap());
-    for (schema, says) in [(&[3, 0, 0, 0][..], "has schema 3"), (&[0, 0, 0, 0], "schema 0"), (b"x", "of unknown form")]
-    {
+    for (schema, says) in [([3, 0, 0, 0], "has schema 3"), ([0, 0, 0, 0], "schema 0")] {
         let db = Database::open(&path).unwrap();
         let write = db.begin_write().unwrap();
-        write.open_table(META).unwrap().insert("schema", schema).unwrap();
+        write.open_table(META).unwrap().insert("schema", &schema[..]).unwrap();
         write.commit().unwrap();
         drop(db);
         let refused = open(&path, 1).unwrap_err();
@@ -119,6 +118,29 @@ fn a_later_schema_is_refused_and_left_alone() {
         let kept = db.begin_read().unwrap().open_table(META).unwrap();
         assert_eq!(kept.get("schema").unwrap().unwrap().value(), schema);
     }
+}
+
+/// No version writes that: where the rest is sealed as we seal, a bit of it turned.
+#[test]
+fn a_schema_that_is_no_number_is_damage_in_a_store_of_ours() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("s.redb");
+    let spoil = |key: &str, value: &[u8]| {
+        let db = Database::open(&path).unwrap();
+        let write = db.begin_write().unwrap();
+        write.open_table(META).unwrap().insert(key, value).unwrap();
+        write.commit().unwrap();
+    };
+    drop(open(&path, 1).unwrap());
+    spoil("schema", b"x");
+    let opened = open(&path, 1).unwrap();
+    assert_eq!((opened.report.damaged_count, opened.report.damaged[0].what.as_str()), (1, "schema"));
+    drop(opened);
+    assert_eq!(open(&path, 1).unwrap().report.damaged_count, 0, "it was mended");
+    spoil("schema", b"x");
+    spoil("owner", b"somebody else's");
+    let refused = open(&path, 1).unwrap_err();
+    assert!(refused.to_string().contains("of unknown form"), "{refused}");
 }
 
 /// The tables as version 1 wrote them: values bare.
