@@ -73,6 +73,13 @@ struct Image {
 #[derive(Clone)]
 pub struct Picture(Vec<u8>);
 
+impl Picture {
+    /// Its bytes, to be spoiled.
+    pub fn bytes(&mut self) -> &mut [u8] {
+        &mut self.0
+    }
+}
+
 /// What a power cut did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cut {

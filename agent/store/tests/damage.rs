@@ -207,3 +207,45 @@ fn a_file_cut_short_is_refused_with_the_advice_to_move_it_away() {
         assert_eq!(std::fs::read(&path).unwrap(), whole[..len], "{len}: it was changed");
     }
 }
+
+/// Every bit of the database's header, and of what says whose store it is and of which schema.
+#[test]
+fn no_bit_of_the_header_or_of_whose_it_is_loses_anything_in_silence() {
+    const HEADER: usize = 320;
+    const NEAR: usize = 40;
+    let disk = filled();
+    let all: BTreeSet<String> = sorted(records()).into_iter().collect();
+    let mut image = disk.picture();
+    let bytes = image.bytes().to_vec();
+    let names: [&[u8]; 3] = [b"schema", b"owner", b"fresh_epoch"];
+    let named = |at: &usize| names.iter().any(|name| bytes[*at..].starts_with(name));
+    let near = (0..bytes.len()).filter(named).flat_map(|at| at..(at + NEAR).min(bytes.len()));
+    let places: BTreeSet<usize> = (0..HEADER).chain(near).collect();
+    let (mut refused, mut mended, mut harmless) = (0, 0, 0);
+    for (at, bit) in places.iter().flat_map(|at| (0..8).map(move |bit| (*at, bit))) {
+        let mut hit = image.clone();
+        hit.bytes()[at] ^= 1 << bit;
+        disk.restore(&hit);
+        let what = format!("bit {bit} of byte {at}");
+        let opened = match Store::open(disk.clone(), owner(), 1) {
+            Ok(opened) => opened,
+            Err(StoreError::NotAStore { .. } | StoreError::Schema { .. }) => {
+                refused += 1;
+                continue;
+            }
+            Err(other) => panic!("{what}: {other}"),
+        };
+        let held: BTreeSet<String> =
+            sorted(opened.restored.records).into_iter().filter(|text| !text.starts_with("EpochClosed")).collect();
+        assert!(held.is_subset(&all), "{what}: something that was never stored");
+        assert!(
+            held == all || opened.report.entries_lost,
+            "{what}: {} records are gone, untold",
+            all.len() - held.len()
+        );
+        mended += u64::from(opened.report.damaged_count > 0);
+        harmless += u64::from(opened.report.damaged_count == 0);
+    }
+    println!("{refused} refused, {mended} mended, {harmless} harmless");
+    assert!(refused > 100 && mended > 100);
+}

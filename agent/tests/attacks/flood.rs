@@ -47,13 +47,13 @@ async fn strangers_in_any_number_cost_no_memory_and_stop_nobody() {
     })
     .await;
 
-    let quiet = state(&outsider, 0).await;
+    let quiet = state(&mut outsider, 0).await;
     let memory = agents.each_ref().map(Agent::memory);
     let (stop, stopped) = tokio::sync::watch::channel(false);
     let flood = tokio::spawn(flood(outsider.voice(), Forgery::new(&outsider), secs, stopped));
     let began = Instant::now();
     tokio::time::sleep(Duration::from_secs(1)).await;
-    let flooded = state(&outsider, HONEST_FACTS).await;
+    let flooded = state(&mut outsider, HONEST_FACTS).await;
     assert!(!flood.is_finished(), "the flood was over before they agreed");
     stop.send(true).unwrap();
     let ids = flood.await.unwrap();
@@ -72,13 +72,16 @@ async fn strangers_in_any_number_cost_no_memory_and_stop_nobody() {
     outsider.leave().await;
 }
 
-/// Has alpha state facts, and waits until beta holds them: how long that took, s. Sightings are numbered from `first`.
-async fn state(outsider: &Outsider, first: u64) -> f64 {
+/// Has alpha state facts, and waits until beta holds them: how long that took, s. Sightings are numbered from `first`, and
+/// of the outsider, who says where it is: of the others the last keyframe may be too long ago.
+async fn state(outsider: &mut Outsider, first: u64) -> f64 {
     let entries = outsider.status("alpha").await.entries;
     let wanted = entries + HONEST_FACTS / 2; // an own queue may be full, too, but not for long
+    let last = last_stamp("alpha");
     let began = Instant::now();
     for number in first..first + HONEST_FACTS {
-        outsider.feed("alpha", "sighting", &sighting(number as i64, "beta")).await;
+        outsider.beacon().await;
+        outsider.feed("alpha", "sighting", &sighting(last + number as i64, "gamma")).await;
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
     until("facts of alpha at beta", async || {
@@ -87,6 +90,13 @@ async fn state(outsider: &Outsider, first: u64) -> f64 {
     })
     .await;
     began.elapsed().as_secs_f64()
+}
+
+/// Of the last keyframe of a robot's recording, ns.
+fn last_stamp(robot: &str) -> i64 {
+    let table = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings").join(robot).join("keyframes.csv");
+    let text = std::fs::read_to_string(table).unwrap();
+    text.lines().last().unwrap().split(',').next().unwrap().parse().unwrap()
 }
 
 async fn both(outsider: &Outsider) -> [StatusView; 2] {

@@ -105,7 +105,8 @@ async fn a_robot_killed_at_any_moment_keeps_all_that_it_told() {
             outsider.beacon().await;
             for _ in 0..2 {
                 sighted += 1;
-                outsider.feed("alpha", "sighting", &sighting(sighted, "gamma")).await;
+                let stamp = keyframe(0, frames).stamp.0 + sighted % 1000;
+                outsider.feed("alpha", "sighting", &sighting(stamp, "gamma")).await;
             }
             if draw(4) == 0 {
                 outsider.sync("alpha").await; // an answer tells facts, too

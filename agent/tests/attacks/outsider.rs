@@ -183,14 +183,14 @@ impl Voice {
     }
 }
 
-/// The `number`-th sighting of a robot.
-pub fn sighting(number: i64, robot: &str) -> SightingMessage {
+/// A sighting of a robot.
+pub fn sighting(stamp_ns: i64, robot: &str) -> SightingMessage {
     let mut covariance = [0.0; 21];
     for diagonal in [0, 6, 11, 15, 18, 20] {
         covariance[diagonal] = 1e-4;
     }
     let (translation, rotation) = ([1.0, 2.0, 0.5], [0.0, 0.0, 0.0, 1.0]);
-    SightingMessage { stamp_ns: number, robot: name(robot), translation, rotation, covariance }
+    SightingMessage { stamp_ns, robot: name(robot), translation, rotation, covariance }
 }
 
 /// An agent as a process; killed with its value.
