@@ -6,7 +6,7 @@
 //! - `keyframes.csv`: a header line ([`KEYFRAMES_HEADER`]), then one line per keyframe with rising stamps:
 //!   `stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,…,c55,cloud` (21 numbers of the covariance's upper triangle, tangent order
 //!   (ρ, φ), local perturbation).
-//! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, one per keyframe.
+//! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, m, one per keyframe.
 //! - the clouds that the keyframes name, relative to the folder, points in the body frame.
 //!
 //! A data set for several robots is a folder whose sub-folders are recordings.
@@ -21,6 +21,8 @@ pub const FORMAT: &str = "merganser-recording";
 pub const KEYFRAMES_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,c02,c03,c04,c05,c11,c12,c13,c14,c15,c22,c23,c24,c25,c33,c34,c35,c44,c45,c55,cloud";
 /// First line of `truth.csv`.
 pub const TRUTH_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw";
+/// Units that a recording may be in, m.
+pub const UNIT_RANGE_M: core::ops::RangeInclusive<f64> = 1e-3..=1e3;
 /// Keyframes in one recording at most.
 pub const KEYFRAMES_MAX: usize = 1_000_000;
 
@@ -46,6 +48,10 @@ pub struct Manifest {
     /// Where the data came from and what was laid on it (drift, cuts), for people.
     #[serde(default)]
     pub origin: String,
+    /// What one is in poses and points, m, where `config.submap.scale = "unknown"` and it is known all the same. The map
+    /// is judged by it; no agent is told. In [`UNIT_RANGE_M`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unit_m: Option<f64>,
     /// Overrides of the agent's core configuration that suit this sensor (e.g. `submap.voxel_m`).
     #[serde(default)]
     pub config: crate::config::Config,

@@ -227,11 +227,10 @@ fn table(report: &Report) -> String {
             robot.merged_with.join(" ")
         );
     }
-    text += &format!("\n{:<22} {:>8} {:>7} {:>9}\n", "relation", "m", "deg", "d²");
+    text += &format!("\n{:<22} {:>8} {:>7} {:>7} {:>9}\n", "relation", "m", "deg", "scale", "d²");
     for e in &report.frame_errors {
-        let d2 = e.d2.map_or_else(|| "-".to_owned(), |d2| format!("{d2:.2}"));
-        text +=
-            &format!("{:<22} {:>8.4} {:>7.3} {:>9}\n", format!("{} -> {}", e.own, e.frame), e.metres, e.degrees, d2);
+        let relation = format!("{} -> {}", e.own, e.frame);
+        text += &format!("{relation:<22} {:>8.4} {:>7.3} {:>7.4} {:>9.2}\n", e.metres, e.degrees, e.scale, e.d2);
     }
     let counts = serde_json::to_value(&report.faults).unwrap_or_default();
     let fired = counts.as_object().into_iter().flatten().filter(|(_, count)| **count != 0);

@@ -3,7 +3,7 @@
 //! is seeded, all floats are printed with a fixed number of digits, and clouds are whole numbers of 2 mm.
 
 use crate::scenario::Scenario;
-use crate::stage::Stage;
+use crate::stage::{Stage, StageError};
 use crate::world::trajectory::Trajectory;
 use core::fmt::Write as _;
 use merganser_protocol::geometry::{Covariance, Se3};
@@ -11,7 +11,9 @@ use merganser_protocol::ids::{Name, NameError};
 use merganser_protocol::recording::{
     CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION, XYZ_I16_UNIT_M,
 };
-use merganser_protocol::submap::CovarianceOf;
+use merganser_protocol::submap::landmarks::DESCRIPTOR_LEN;
+use merganser_protocol::submap::{CovarianceOf, Mark};
+use merganser_protocol::wire::fact::ScaleKind;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
@@ -34,7 +36,7 @@ pub enum RecordError {
     Name(#[from] NameError),
     /// The scenario's drives cannot be made.
     #[error(transparent)]
-    Stage(#[from] crate::stage::StageError),
+    Stage(#[from] StageError),
     /// The manifest cannot be written as TOML.
     #[error(transparent)]
     Toml(#[from] toml::ser::Error),
@@ -105,9 +107,12 @@ fn record_robot(
     };
     let steps = stage.steps(robot);
     for (index, step) in steps.iter().enumerate() {
-        let cloud = format!("clouds/{index:04}.xyz");
-        let points = stage.scan(robot, index);
-        put(folder.join(&cloud), &pack(&points))?;
+        let (points, marks) = stage.scan(robot, index).map_err(StageError::Drift)?;
+        let (cloud, bytes) = match scenario.landmarks {
+            Some(_) => (format!("clouds/{index:04}.ply"), landmarks(&points, &marks)),
+            None => (format!("clouds/{index:04}.xyz"), pack(&points)),
+        };
+        put(folder.join(&cloud), &bytes)?;
         done.points += points.len();
         let stamp = FIRST_STAMP_NS.saturating_add_unsigned(step.nanos);
         let odometry = numbers(&pose(&step.t_frame_body), false);
@@ -118,24 +123,33 @@ fn record_robot(
     }
     put(folder.join("keyframes.csv"), keyframes.as_bytes())?;
     put(folder.join("truth.csv"), truth.as_bytes())?;
-    put(folder.join("recording.toml"), manifest(scenario, origin, name, steps.len())?.as_bytes())?;
+    put(folder.join("recording.toml"), manifest(scenario, origin, name, steps.len(), stage.unit_m(robot))?.as_bytes())?;
     done.keyframes = steps.len();
     done.metres = scenario.drive.keyframe_m * steps.len().saturating_sub(1) as f64;
     done.secs = steps.last().map_or(0.0, |step| step.nanos as f64 * 1e-9);
     Ok(done)
 }
 
-fn manifest(scenario: &Scenario, origin: &str, name: &str, keyframes: usize) -> Result<String, RecordError> {
+fn manifest(
+    scenario: &Scenario,
+    origin: &str,
+    name: &str,
+    keyframes: usize,
+    unit_m: f64,
+) -> Result<String, RecordError> {
+    let config = scenario.config_of(name);
+    let unit_is_unknown = config.submap.scale == ScaleKind::Unknown;
     let manifest = Manifest {
         format: FORMAT.to_owned(),
         version: VERSION,
         robot: Name::new(name)?,
-        sensor: "lidar3d".to_owned(),
+        sensor: if scenario.landmarks.is_some() { "camera" } else { "lidar3d" }.to_owned(),
         covariance_of: CovarianceOf::Motion,
-        clouds: CloudFormat::XyzI16,
+        clouds: if scenario.landmarks.is_some() { CloudFormat::Ply } else { CloudFormat::XyzI16 },
         keyframes,
         origin: origin.to_owned(),
-        config: scenario.config.clone(),
+        unit_m: unit_is_unknown.then_some(unit_m),
+        config,
     };
     Ok(toml::to_string(&manifest)?)
 }
@@ -161,6 +175,22 @@ fn numbers(values: &[f64], scientific: bool) -> String {
 fn pack(points: &[[f32; 3]]) -> Vec<u8> {
     let unit = |v: f32| libm::round(f64::from(v) / XYZ_I16_UNIT_M) as i16;
     points.iter().flatten().flat_map(|&v| unit(v).to_le_bytes()).collect()
+}
+
+/// A binary PLY: places, their covariances, and descriptors.
+fn landmarks(points: &[[f32; 3]], marks: &[Mark]) -> Vec<u8> {
+    let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", points.len());
+    ["x", "y", "z"].iter().for_each(|name| text += &format!("property float {name}\n"));
+    ["xx", "xy", "xz", "yy", "yz", "zz"].iter().for_each(|name| text += &format!("property float c{name}\n"));
+    (0..DESCRIPTOR_LEN).for_each(|k| text += &format!("property uchar d{k}\n"));
+    let mut bytes = (text + "end_header\n").into_bytes();
+    for (point, mark) in points.iter().zip(marks) {
+        let m = mark.covariance.matrix();
+        let upper = (0..3).flat_map(|row| (row..3).map(move |column| m[(row, column)] as f32));
+        bytes.extend(point.iter().copied().chain(upper).flat_map(f32::to_le_bytes));
+        bytes.extend(mark.descriptor.unwrap_or_default());
+    }
+    bytes
 }
 
 fn write_file(path: PathBuf, bytes: &[u8]) -> Result<(), RecordError> {

@@ -33,7 +33,7 @@ pub struct Report {
     pub robots: Vec<RobotReport>,
     /// Each robot's error about each other frame that it merged.
     pub frame_errors: Vec<FrameError>,
-    /// Mean of `d2` over `frame_errors`; about 6 for honest covariances. `None` without merged frames.
+    /// Mean of `d2` over `frame_errors`; about 6 for honest covariances, 7 where units are unknown. `None` without merged frames.
     pub mean_d2: Option<f64>,
     /// Messages by kind, for each robot of the scenario.
     pub sent: BTreeMap<String, BTreeMap<&'static str, Usage>>,
@@ -86,7 +86,7 @@ impl Report {
             expect: &outcome.scenario.expect,
         };
         let frame_errors = frame_errors(&sample);
-        let d2: Vec<f64> = frame_errors.iter().filter_map(|e| e.d2).collect();
+        let d2: Vec<f64> = frame_errors.iter().map(|e| e.d2).collect();
         let names = outcome.stage.names();
         Self {
             scenario: outcome.scenario.clone(),

@@ -6,8 +6,10 @@ use crate::field::Layout;
 use crate::network::NetworkOptions;
 use crate::world::WorldOptions;
 use crate::world::drive::DriveOptions;
+use crate::world::landmarks::LandmarkOptions;
 use crate::world::sensor::SensorOptions;
-use merganser_protocol::config::{Config, ConfigError};
+use merganser_protocol::config::{Config, ConfigError, Sensor};
+use merganser_protocol::wire::fact::ScaleKind;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -43,6 +45,9 @@ pub struct Scenario {
     /// What they see with.
     #[serde(default)]
     pub sensor: SensorOptions,
+    /// A camera whose SLAM keeps landmarks, in the sensor's place: none by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub landmarks: Option<LandmarkOptions>,
     /// What takes the place of scans and their alignment, for runs that are about replication: none by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub summary: Option<SummaryOptions>,
@@ -178,6 +183,15 @@ impl Scenario {
         (0..self.robots).map(name).collect()
     }
 
+    /// The core's configuration on this robot.
+    pub fn config_of(&self, robot: &str) -> Config {
+        let mut config = self.config.clone();
+        if self.landmarks.as_ref().is_some_and(|camera| camera.metric.iter().any(|name| name == robot)) {
+            config.submap.scale = ScaleKind::Metric;
+        }
+        config
+    }
+
     fn validate(&self) -> Result<(), ScenarioError> {
         range("robots", self.robots as f64, 1.0, ROBOTS_MAX as f64, "use 1 to 1000 robots")?;
         range("duration_secs", self.duration_secs, 1.0, DURATION_MAX_SECS, "use 1 s to a day")?;
@@ -197,6 +211,7 @@ impl Scenario {
             range("summary.common", summary.common, 0.0, 0.5, "use 0 to 0.5")?;
             summary.liars.iter().try_for_each(|liar| self.validate_name("summary.liars", liar))?;
         }
+        self.validate_landmarks()?;
         range("expect.error_max_m", self.expect.error_max_m, 1e-6, 1e6, "use a positive length")?;
         range("expect.error_max_deg", self.expect.error_max_deg, 1e-6, 180.0, "use 0 to 180 degrees")?;
         for (key, value, low, high, mend) in self.network.ranges().into_iter().chain(self.radio.ranges()) {
@@ -234,6 +249,23 @@ impl Scenario {
         range("sensor.range_m[1]", s.range_m[1], 0.1, 60.0, "use 0.1 to 60 m")?;
         range("sensor.range_sigma_m", s.range_sigma_m, 0.0, 1.0, "use 0 to 1 m")?;
         range("sensor.dropout", s.dropout, 0.0, 1.0, "use 0 to 1")
+    }
+
+    fn validate_landmarks(&self) -> Result<(), ScenarioError> {
+        let sensor = self.config.submap.sensor;
+        if sensor.sees_landmarks() != self.landmarks.is_some()
+            || sensor == Sensor::Landmarks2d
+            || (self.landmarks.is_some() && self.summary.is_some())
+        {
+            let (key, value) = ("config.submap.sensor".to_owned(), format!("{sensor:?}"));
+            let mend = "[landmarks] and sensor = \"landmarks\" go together, without [summary]";
+            return Err(ScenarioError::Value { key, value, mend });
+        }
+        let Some(camera) = &self.landmarks else { return Ok(()) };
+        for (key, value, low, high, mend) in camera.ranges() {
+            range(key, value, low, high, mend)?;
+        }
+        camera.metric.iter().try_for_each(|robot| self.validate_name("landmarks.metric", robot))
     }
 
     fn validate_fault(&self, index: usize, fault: &Fault) -> Result<(), ScenarioError> {
@@ -302,6 +334,16 @@ mod tests {
             ("[sensor]\nrange_m = [5.0, 1.0]", "sensor.range_m[0] = 5", "shortest"),
             ("[config.submap]\nvoxel_m = 0.0", "config.submap.voxel_m = 0", "0.001 to 10"),
             ("[config]\nvoxel = 1", "voxel", "unknown field"),
+            ("[landmarks]", "config.submap.sensor = Points3d", "go together"),
+            ("[config.submap]\nsensor = \"landmarks\"", "config.submap.sensor = Landmarks", "go together"),
+            ("[landmarks]\n[config.submap]\nsensor = \"landmarks_2d\"", "= Landmarks2d", "go together"),
+            ("[landmarks]\nseen = 1.1\n[config.submap]\nsensor = \"landmarks\"", "landmarks.seen = 1.1", "0 to 1"),
+            ("[landmarks]\nunit_m = [2.0, 1.0]\n[config.submap]\nsensor = \"landmarks\"", "unit_m[0] = 2", "then most"),
+            (
+                "[landmarks]\nmetric = [\"delta\"]\n[config.submap]\nsensor = \"landmarks\"",
+                "metric = \"delta\"",
+                "alpha",
+            ),
             ("[[faults]]\nkind = \"kill\"\nat = 1\nlasts = 2\nrobot = \"delta\"", "faults[0].robot", "alpha, beta"),
             ("[[faults]]\nkind = \"kill\"\nat = 9\nlasts = 2\nrobot = \"beta\"", "faults[0].lasts = 2", "within"),
             ("[[faults]]\nkind = \"kill\"\nat = 11\nlasts = 0\nrobot = \"beta\"", "faults[0].at = 11", "within"),

@@ -5,10 +5,12 @@ use crate::dice::Dice;
 use crate::scenario::Scenario;
 use crate::world::World;
 use crate::world::drive::{Step, drive};
+use crate::world::landmarks::{Camera, Sightings};
 use crate::world::path::Path;
 use crate::world::sensor::Sensor;
 use crate::world::trajectory::{Trajectory, TrajectoryError};
-use merganser_protocol::geometry::CovarianceError;
+use merganser_protocol::geometry::{CovarianceError, Se3};
+use merganser_protocol::wire::fact::ScaleKind;
 use thiserror::Error;
 
 /// World, drives and sensor.
@@ -18,6 +20,10 @@ pub struct Stage {
     names: Vec<String>,
     world: World,
     sensor: Sensor,
+    /// Takes the sensor's place.
+    camera: Option<Camera>,
+    /// What each robot's SLAM takes for one, m.
+    units_m: Vec<f64>,
     /// Points of a made-up scan, at summary level.
     made_up: Option<usize>,
     steps: Vec<Vec<Step>>,
@@ -59,13 +65,29 @@ impl Stage {
 
     fn of(scenario: &Scenario, paths: &[Path], seed: u64) -> Result<Self, StageError> {
         let world = World::generate(&scenario.world, paths, seed);
+        let names = scenario.names();
+        let unit = |robot: usize| match &scenario.landmarks {
+            Some(camera) if scenario.config_of(&names[robot]).submap.scale == ScaleKind::Unknown => {
+                let [least, most] = camera.unit_m;
+                least * libm::pow(most / least, Dice::new(seed, &format!("unit {robot}")).uniform())
+            }
+            _ => 1.0,
+        };
+        let units_m: Vec<f64> = (0..scenario.robots).map(unit).collect();
         let one = |(robot, path)| {
             let mut dice = Dice::new(seed, &format!("drive {robot}"));
-            drive(&scenario.drive, path, scenario.duration_secs, &mut dice)
+            let steps = drive(&scenario.drive, path, scenario.duration_secs, &mut dice)?;
+            steps.into_iter().map(|step| step.in_units(units_m[robot])).collect::<Result<_, _>>()
         };
-        let steps = paths.iter().enumerate().map(one).collect::<Result<_, _>>()?;
+        let steps: Vec<Vec<Step>> = paths.iter().enumerate().map(one).collect::<Result<_, CovarianceError>>()?;
+        let camera = scenario.landmarks.as_ref().map(|options| {
+            let places: Vec<Se3> = steps.iter().flatten().map(|step| step.t_world_body).collect();
+            let cell_m = scenario.world.aliased.then_some(scenario.world.cell_m);
+            Camera::new(options.clone(), &world, &places, cell_m, &mut Dice::new(seed, "landmarks"))
+        });
         let made_up = scenario.summary.as_ref().map(|summary| summary.points);
-        Ok(Self { seed, names: scenario.names(), world, sensor: Sensor::new(scenario.sensor.clone()), made_up, steps })
+        let sensor = Sensor::new(scenario.sensor.clone());
+        Ok(Self { seed, names, world, sensor, camera, units_m, made_up, steps })
     }
 
     /// The robots' names.
@@ -83,12 +105,24 @@ impl Stage {
         &self.steps[robot]
     }
 
-    /// The points of one keyframe, body frame, m.
-    pub fn scan(&self, robot: usize, index: usize) -> Vec<[f32; 3]> {
+    /// What one robot's SLAM takes for one, m.
+    pub fn unit_m(&self, robot: usize) -> f64 {
+        self.units_m[robot]
+    }
+
+    /// The points of one keyframe, body frame, in its SLAM's unit, and a mark for each if they are landmarks.
+    ///
+    /// # Errors
+    /// [`CovarianceError`] if the options of landmarks give a noise that no covariance can hold.
+    pub fn scan(&self, robot: usize, index: usize) -> Result<Sightings, CovarianceError> {
         let mut dice = Dice::new(self.seed, &format!("scan {robot} {index}"));
         if let Some(points) = self.made_up {
-            return (0..points).map(|_| [0; 3].map(|_| dice.range(-1.5, 1.5) as f32)).collect();
+            return Ok(((0..points).map(|_| [0; 3].map(|_| dice.range(-1.5, 1.5) as f32)).collect(), Vec::new()));
         }
-        self.sensor.scan(&self.world, &self.steps[robot][index].t_world_body, &mut dice)
+        let t_world_body = &self.steps[robot][index].t_world_body;
+        match &self.camera {
+            Some(camera) => camera.look(&self.world, t_world_body, self.units_m[robot], &mut dice),
+            None => Ok((self.sensor.scan(&self.world, t_world_body, &mut dice), Vec::new())),
+        }
     }
 }

@@ -6,7 +6,7 @@ use crate::swarm::Outcome;
 use crate::truth::rigid;
 use crate::world::shape::Shape;
 use core::fmt::Write as _;
-use merganser_protocol::geometry::Se3;
+use merganser_protocol::geometry::{Se3, Sim3};
 use std::collections::BTreeMap;
 
 /// Edge of one of the two panels, in picture units.
@@ -57,7 +57,8 @@ fn merged<C>(outcome: &Outcome<C>) -> BTreeMap<usize, Vec<[f64; 2]>> {
         let pose = submap.t_own_anchor.as_ref().map(|t| &t.pose).or(own.then_some(&submap.t_frame_anchor));
         let robot = outcome.stage.names().iter().position(|name| *name == submap.robot);
         if let (Some(t_own_anchor), Some(robot)) = (pose.and_then(rigid), robot) {
-            lines.entry(robot).or_default().push(ground(&(*t_world_own * t_own_anchor)));
+            let place = *t_world_own * Sim3::from_se3(&t_own_anchor);
+            lines.entry(robot).or_default().push([place.translation.x, place.translation.y]);
         }
     }
     lines

@@ -1,9 +1,10 @@
-//! How far the swarm's beliefs are from the truth: each robot's merged frames against where those frames really lie.
+//! How far the swarm's beliefs are from the truth: each robot's merged frames against where those frames really lie, and
+//! what one is in them.
 
 use crate::check::{RobotSample, Sample};
-use merganser_protocol::geometry::{Covariance, Se3, So3};
+use merganser_protocol::geometry::{Covariance, Se3, Sim3, So3};
 use merganser_protocol::snapshot::{FrameView, PoseView, RelationView};
-use nalgebra::{SMatrix, Vector6};
+use nalgebra::{SMatrix, SVector};
 use serde::Serialize;
 
 /// The error of one robot's belief about one other frame.
@@ -17,10 +18,12 @@ pub struct FrameError {
     pub metres: f64,
     /// Error of the rotation, degrees.
     pub degrees: f64,
-    /// Scale over its true value (1 for metric frames).
+    /// Scale over its true value.
     pub scale: f64,
-    /// Normalised error squared, `δᵀ P⁻¹ δ`; `None` for similarities.
-    pub d2: Option<f64>,
+    /// Normalised error squared, `δᵀ P⁻¹ δ`; infinite if the covariance is none.
+    pub d2: f64,
+    /// Its degrees of freedom: 6, or 7 where a unit is unknown.
+    pub degrees_of_freedom: u32,
 }
 
 /// The errors of all frames that any robot has merged with its own, where the truth is known; of a liar's, not those of
@@ -39,37 +42,47 @@ fn errors_of(robot: &RobotSample, sample: &Sample<'_>) -> Vec<FrameError> {
         .filter_map(|frame| {
             let relation = frame.t_own_frame.as_ref()?;
             let truth = t_world_own.inverse() * *sample.truth.get(&frame.frame)?;
-            Some(error(own, &frame.frame, relation, &truth))
+            Some(error(own, &frame.frame, relation, &truth, t_world_own.scale))
         })
         .collect()
 }
 
-fn error(own: &str, frame: &str, relation: &RelationView, truth: &Se3) -> FrameError {
-    let (metres, degrees, d2) = match rigid(&relation.pose) {
-        None => (f64::NAN, f64::NAN, Some(f64::INFINITY)),
-        Some(estimate) => {
-            let delta = estimate.local(truth);
-            let apart = (estimate.translation - truth.translation).norm();
-            (apart, (estimate.inverse() * *truth).rotation.angle().to_degrees(), normalised(relation, &delta))
-        }
-    };
-    FrameError { own: own.to_owned(), frame: frame.to_owned(), metres, degrees, scale: relation.pose.scale, d2 }
-}
-
-/// `δᵀ P⁻¹ δ` of a rigid relation's error; `None` for similarities, infinite for what is none.
-pub fn nees(relation: &RelationView, truth: &Se3) -> Option<f64> {
-    match rigid(&relation.pose) {
-        None => Some(f64::INFINITY),
-        Some(estimate) => normalised(relation, &estimate.local(truth)),
+/// `unit_m` is what one is in the own frame.
+fn error(own: &str, frame: &str, relation: &RelationView, truth: &Sim3, unit_m: f64) -> FrameError {
+    let estimate = similarity(&relation.pose);
+    let apart = |estimate: Sim3| unit_m * (estimate.translation - truth.translation).norm();
+    let turned = |estimate: Sim3| (estimate.rotation.inverse() * truth.rotation).angle().to_degrees();
+    FrameError {
+        own: own.to_owned(),
+        frame: frame.to_owned(),
+        metres: estimate.map_or(f64::NAN, apart),
+        degrees: estimate.map_or(f64::NAN, turned),
+        scale: relation.pose.scale / truth.scale,
+        d2: estimate.map_or(f64::INFINITY, |estimate| match relation.covariance.len() {
+            28 => normalised(relation, &estimate.local(truth)),
+            _ => normalised(relation, &estimate.to_se3().local(&truth.to_se3())),
+        }),
+        degrees_of_freedom: if relation.covariance.len() == 28 { 7 } else { 6 },
     }
 }
 
-/// `None` unless the covariance is that of a rigid motion; infinite if it is no covariance.
-fn normalised(relation: &RelationView, delta: &Vector6<f64>) -> Option<f64> {
-    (relation.covariance.len() == 21).then(|| {
-        let covariance = Covariance::new(square::<6>(&relation.covariance));
-        covariance.map_or(f64::INFINITY, |p| p.mahalanobis_squared(delta))
-    })
+/// `δᵀ P⁻¹ δ` of a rigid relation's error; infinite for what is none.
+pub fn nees(relation: &RelationView, truth: &Se3) -> f64 {
+    rigid(&relation.pose).map_or(f64::INFINITY, |estimate| normalised(relation, &estimate.local(truth)))
+}
+
+/// Infinite unless the covariance is one, of as many values as the error has.
+fn normalised<const N: usize>(relation: &RelationView, delta: &SVector<f64, N>) -> f64 {
+    if relation.covariance.len() != N * (N + 1) / 2 {
+        return f64::INFINITY;
+    }
+    Covariance::new(square::<N>(&relation.covariance)).map_or(f64::INFINITY, |p| p.mahalanobis_squared(delta))
+}
+
+/// A pose with its scale; `None` if it is not finite, or its quaternion or scale are none.
+pub fn similarity(pose: &PoseView) -> Option<Sim3> {
+    let rigid = rigid(pose)?;
+    (pose.scale.is_finite() && pose.scale > 0.0).then(|| Sim3::new(rigid.rotation, rigid.translation, pose.scale))
 }
 
 /// The rigid part of a pose; `None` if it is not finite or its quaternion is zero.

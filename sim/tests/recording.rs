@@ -77,7 +77,7 @@ fn what_is_written_is_what_was_driven() {
             let c55 = step.motion.covariance.matrix()[(5, 5)];
             assert!((number(&row[28]) / c55 - 1.0).abs() < 1e-6);
             let cloud = std::fs::read(root.join(&row[29])).unwrap();
-            let points = stage.scan(robot, index);
+            let (points, _) = stage.scan(robot, index).unwrap();
             assert_eq!(cloud.len(), points.len() * 6);
             let units = cloud.chunks_exact(2).map(|b| f64::from(i16::from_le_bytes([b[0], b[1]])));
             for (unit, value) in units.zip(points.iter().flatten()) {

@@ -351,6 +351,7 @@ fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             clouds: CloudFormat::Ply,
             keyframes: 0,
             origin: "a test".into(),
+            unit_m: None,
             config: merganser_protocol::config::Config::default(),
         };
         let mut writer = Writer::create(&folder.join(&track.name), manifest).unwrap();

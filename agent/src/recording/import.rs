@@ -191,6 +191,7 @@ impl Cut<'_> {
             clouds: CloudFormat::Ply,
             keyframes: 0,
             origin: format!("{}; laid on the true motion: {} (1 σ, seed {})", self.origin, self.drift, self.seed),
+            unit_m: None,
             config: self.config.clone(),
         })
     }

@@ -62,6 +62,7 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
             covariance_of: CovarianceOf::Motion,
             clouds: CloudFormat::Ply,
             keyframes: 0,
+            unit_m: None,
             origin: format!(
                 "CARMEN log of {} scans, real odometry; every third scan from {from} to {to} (counted from 0)",
                 scans.len()

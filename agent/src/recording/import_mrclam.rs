@@ -75,6 +75,7 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
             keyframes: 0,
             origin: "MRCLAM logs, whole; every other sighting of a landmark corrects the odometry, the others are handed over"
                 .into(),
+            unit_m: None,
             config: config.clone(),
         };
         let mut writer = Writer::create(&folder, manifest)?;

@@ -21,6 +21,7 @@ fn write_good(folder: &Path, robot: &str) {
         clouds: CloudFormat::XyzBin,
         keyframes: 0,
         origin: "a test".into(),
+        unit_m: None,
         config: Config::default(),
     };
     let mut writer = Writer::create(folder, manifest).unwrap();

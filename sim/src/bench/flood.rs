@@ -103,6 +103,7 @@ fn scenario(robots: usize, flooded: bool) -> Scenario {
     config.submap.keypoints = 16;
     config.align.candidates_max = 24;
     let mut scenario = Scenario {
+        landmarks: None,
         radio: Layout::Mesh,
         name: "flood".into(),
         about: "halves that heal in a flood of strangers".into(),

@@ -1,6 +1,6 @@
 //! A merged frame's error fits the covariance claimed for it: at the end of a run, the squared normalised error of every
-//! pair of frames must be one that χ² with 6 degrees of freedom exceeds with a chance above 1e-4, all pairs of the run
-//! taken together (Bonferroni).
+//! pair of frames must be one that χ² with 6 degrees of freedom (7 where a unit is unknown) exceeds with a chance above
+//! 1e-4, all pairs of the run taken together (Bonferroni).
 
 use super::{Check, Phase, Sample};
 use crate::truth::frame_errors;
@@ -25,8 +25,8 @@ impl Check for HonestCovariance {
         // Each pair is seen from both sides.
         let pairs = errors.len().div_ceil(2).max(1) as f64;
         for e in errors {
-            let Some(d2) = e.d2 else { continue };
-            let chance = puruspe::gammq(3.0, 0.5 * d2.min(1e6));
+            let d2 = e.d2;
+            let chance = puruspe::gammq(0.5 * f64::from(e.degrees_of_freedom), 0.5 * d2.min(1e6));
             if chance.is_nan() || chance * pairs < FALSE_ALARM {
                 return Err(format!(
                     "{} places {} {:.4} m and {:.3}° off: d² = {d2:.1}, of which honest covariances have a chance of \
@@ -44,13 +44,14 @@ mod tests {
     use super::super::tests::{relation, robot, sample};
     use super::*;
     use crate::scenario::Expect;
-    use merganser_protocol::geometry::Se3;
-    use nalgebra::Vector6;
+    use merganser_protocol::geometry::{Covariance, Relative, Se3, Sim3, SimWithCovariance};
+    use merganser_protocol::snapshot::RelationView;
+    use nalgebra::{SVector, Vector6};
     use std::collections::BTreeMap;
 
     #[test]
     fn it_bites_at_the_stated_chance() {
-        let truth = BTreeMap::from([("alpha/1".to_owned(), Se3::identity()), ("beta/1".to_owned(), Se3::identity())]);
+        let truth = BTreeMap::from(["alpha/1", "beta/1"].map(|frame| (frame.to_owned(), Sim3::identity())));
         let expect = Expect::default();
         let verdict = |d2: f64, phase| {
             let sigma = 0.01;
@@ -63,5 +64,23 @@ mod tests {
         assert!(verdict(27.9, Phase::End).is_err());
         assert!(verdict(27.9, Phase::Calm).is_ok());
         assert!(verdict(f64::INFINITY, Phase::End).is_err());
+    }
+
+    #[test]
+    fn a_unit_is_one_value_more() {
+        let beta = Sim3::exp(&SVector::<f64, 7>::from([1.0, 2.0, 0.5, 0.1, -0.2, 1.0, 0.7]));
+        let truth = BTreeMap::from([("alpha/1".to_owned(), Sim3::identity()), ("beta/1".to_owned(), beta)]);
+        let expect = Expect::default();
+        let verdict = |d2: f64| {
+            let sigma = 0.01;
+            let off = SVector::<f64, 7>::from([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, d2.sqrt() * sigma]);
+            let covariance = Covariance::from_sigmas([sigma; 7]).unwrap();
+            let relation = Relative::Similarity(SimWithCovariance { sim: beta.retract(&off), covariance });
+            let robots = vec![robot("alpha", 1, &[("beta/1", RelationView::from(&relation))])];
+            HonestCovariance.sample(&sample(robots, &truth, &expect))
+        };
+        // χ²₇ at 99.99 % is 29.878.
+        assert!(verdict(29.8).is_ok());
+        assert!(verdict(29.95).is_err());
     }
 }

@@ -19,7 +19,7 @@ mod unique_entries;
 
 use crate::scenario::Expect;
 use merganser_protocol::agent::io::Output;
-use merganser_protocol::geometry::Se3;
+use merganser_protocol::geometry::Sim3;
 use merganser_protocol::ids::{FrameId, Hash, RobotId};
 use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::time::Instant;
@@ -96,8 +96,8 @@ pub struct Sample<'a> {
     pub robots: Vec<RobotSample>,
     /// The others, but for those that have left for good.
     pub down: Vec<String>,
-    /// `t_world_frame` of every frame, by `name/epoch`.
-    pub truth: &'a BTreeMap<String, Se3>,
+    /// `t_world_frame` of every frame, by `name/epoch`; the scale is its unit, m.
+    pub truth: &'a BTreeMap<String, Sim3>,
     /// What the scenario asks for.
     pub expect: &'a Expect,
 }
@@ -177,7 +177,7 @@ impl Checks {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative};
+    use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
     use merganser_protocol::snapshot::{
         FrameView, FramesView, GraphView, MapView, PosesView, RelationView, StatsView, StatusView,
     };
@@ -235,7 +235,7 @@ pub(crate) mod tests {
     }
 
     /// A last sample of these robots.
-    pub fn sample<'a>(robots: Vec<RobotSample>, truth: &'a BTreeMap<String, Se3>, expect: &'a Expect) -> Sample<'a> {
+    pub fn sample<'a>(robots: Vec<RobotSample>, truth: &'a BTreeMap<String, Sim3>, expect: &'a Expect) -> Sample<'a> {
         Sample { at: Instant::ZERO, phase: Phase::End, robots, down: Vec::new(), truth, expect }
     }
 }

@@ -36,7 +36,7 @@ mod tests {
     use super::super::tests::{relation, robot, sample};
     use super::*;
     use crate::scenario::Expect;
-    use merganser_protocol::geometry::Se3;
+    use merganser_protocol::geometry::{Se3, Sim3};
     use nalgebra::Vector6;
     use std::collections::BTreeMap;
 
@@ -45,8 +45,8 @@ mod tests {
         let t_alpha_beta = Se3::exp(&Vector6::new(3.0, -1.0, 0.0, 0.0, 0.0, 2.0));
         let t_world_alpha = Se3::exp(&Vector6::new(9.0, 5.0, 0.0, 0.0, 0.0, -1.0));
         let truth = BTreeMap::from([
-            ("alpha/1".to_owned(), t_world_alpha),
-            ("beta/1".to_owned(), t_world_alpha * t_alpha_beta),
+            ("alpha/1".to_owned(), Sim3::from_se3(&t_world_alpha)),
+            ("beta/1".to_owned(), Sim3::from_se3(&(t_world_alpha * t_alpha_beta))),
         ]);
         let expect = Expect { error_max_m: 0.5, error_max_deg: 5.0, ..Expect::default() };
         let verdict = |metres: f64, degrees: f64| {
@@ -61,7 +61,7 @@ mod tests {
 
     #[test]
     fn a_false_scale_is_a_false_merge() {
-        let truth = BTreeMap::from(["alpha/1", "beta/1"].map(|frame| (frame.to_owned(), Se3::identity())));
+        let truth = BTreeMap::from(["alpha/1", "beta/1"].map(|frame| (frame.to_owned(), Sim3::identity())));
         let expect = Expect { error_max_m: 0.5, error_max_deg: 5.0, ..Expect::default() };
         let verdict = |scale: f64| {
             let mut relation = relation(Se3::identity(), 1.0);
@@ -74,7 +74,7 @@ mod tests {
 
     #[test]
     fn a_liar_may_deceive_itself_of_itself_alone() {
-        let truth = BTreeMap::from(["alpha/1", "alpha/2", "beta/1"].map(|frame| (frame.to_owned(), Se3::identity())));
+        let truth = BTreeMap::from(["alpha/1", "alpha/2", "beta/1"].map(|frame| (frame.to_owned(), Sim3::identity())));
         let expect = Expect { error_max_m: 0.5, error_max_deg: 5.0, ..Expect::default() };
         let verdict = |lies: bool, frame: &str| {
             let off = Se3::exp(&Vector6::new(9.0, 0.0, 0.0, 0.0, 0.0, 0.0));

@@ -2,11 +2,11 @@
 //! between two frames to within 1e-9.
 
 use super::{Check, RobotSample, Sample};
-use crate::truth::rigid;
-use merganser_protocol::geometry::Se3;
+use crate::truth::similarity;
+use merganser_protocol::geometry::Sim3;
 use std::collections::BTreeMap;
 
-/// Largest difference of a relation between two frames, m and rad.
+/// Largest difference of a relation between two frames, m (or units), rad and log-scale.
 const DIFFERENCE_MAX: f64 = 1e-9;
 
 /// See the module.
@@ -36,14 +36,14 @@ impl Check for SameEstimate {
 }
 
 /// `t_own_frame` of every frame connected to the robot's own.
-type Frames = BTreeMap<String, Se3>;
+type Frames = BTreeMap<String, Sim3>;
 
 fn frames(robot: &RobotSample) -> Option<Frames> {
     let snapshot = robot.snapshot.as_ref().filter(|snapshot| snapshot.status.idle)?;
     let known = snapshot.frames.frames.iter();
     let mut frames: Frames =
-        known.filter_map(|f| Some((f.frame.clone(), rigid(&f.t_own_frame.as_ref()?.pose)?))).collect();
-    frames.insert(snapshot.frames.own.clone(), Se3::identity());
+        known.filter_map(|f| Some((f.frame.clone(), similarity(&f.t_own_frame.as_ref()?.pose)?))).collect();
+    frames.insert(snapshot.frames.own.clone(), Sim3::identity());
     Some(frames)
 }
 
@@ -68,7 +68,9 @@ mod tests {
     use super::super::tests::{relation, robot, sample};
     use super::*;
     use crate::scenario::Expect;
-    use nalgebra::Vector6;
+    use merganser_protocol::geometry::{Covariance, Relative, Se3, SimWithCovariance};
+    use merganser_protocol::snapshot::RelationView;
+    use nalgebra::{SVector, Vector6};
 
     #[test]
     fn it_bites_on_the_smallest_difference() {
@@ -94,5 +96,22 @@ mod tests {
         let one = robot("alpha", 1, &[("beta/1", relation(Se3::identity(), 0.1))]);
         let other = robot("beta", 1, &[]);
         assert!(SameEstimate.sample(&sample(vec![one, other], &truth, &expect)).is_err());
+    }
+    #[test]
+    fn it_bites_on_a_difference_in_scale_alone() {
+        let (truth, expect) = (BTreeMap::new(), Expect::default());
+        let t_alpha_beta = Sim3::exp(&SVector::<f64, 7>::from([1.0, 2.0, 0.0, 0.0, 0.0, 0.5, 0.3]));
+        let verdict = |off: f64| {
+            let covariance = Covariance::from_sigmas([0.1; 7]).unwrap();
+            let view = |sim| RelationView::from(&Relative::Similarity(SimWithCovariance { sim, covariance }));
+            let other = t_alpha_beta.retract(&SVector::<f64, 7>::from([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, off])).inverse();
+            let robots = vec![
+                robot("alpha", 1, &[("beta/1", view(t_alpha_beta))]),
+                robot("beta", 1, &[("alpha/1", view(other))]),
+            ];
+            SameEstimate.sample(&sample(robots, &truth, &expect))
+        };
+        assert!(verdict(0.0).is_ok());
+        assert!(verdict(1e-8).is_err());
     }
 }

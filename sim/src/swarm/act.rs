@@ -188,13 +188,13 @@ impl<C: Core> Swarm<C> {
             self.counts.keyframes_missed += 1;
             return;
         }
-        let points = self.stopwatch.time("scan", || self.stage.scan(drive, index));
-        let keyframe = match one.slam.keyframe(step, points) {
+        let seen = self.stopwatch.time("scan", || self.stage.scan(drive, index));
+        let keyframe = match seen.and_then(|seen| one.slam.keyframe(step, seen)) {
             Ok(keyframe) => keyframe,
             Err(error) => return self.object("stage", error.to_string()),
         };
         one.keyframes += 1;
-        let t_world_frame = step.t_world_body * keyframe.pose.pose.inverse();
+        let t_world_frame = one.slam.t_world_frame(step, self.stage.unit_m(drive));
         self.feed(now, robot, Input::Keyframe(keyframe));
         // Where the frame of a new epoch lies, until its first submap says it exactly.
         let one = &self.robots[robot];

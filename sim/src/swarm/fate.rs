@@ -46,7 +46,8 @@ impl<C: Core> Swarm<C> {
         let restored = Restored { records, fresh_epoch };
         let seed = Dice::new(self.seed, &format!("agent {index} {incarnation}")).bits();
         let robot = &mut self.robots[index];
-        let core = C::start(self.scenario.config.clone(), robot.identity.clone(), seed, restored, robot.local(now))
+        let config = self.scenario.config_of(robot.name.as_str());
+        let core = C::start(config, robot.identity.clone(), seed, restored, robot.local(now))
             .map_err(|error| SwarmError::Start(robot.name.to_string(), error))?;
         robot.core = Some(core);
         self.trace.note(now, index, "boot");

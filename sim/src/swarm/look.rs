@@ -113,7 +113,7 @@ impl<C: Core> Swarm<C> {
                 let slam = &self.robots[robot].slam;
                 let nanos = slam.drive_nanos(submap.stamps_secs[0]);
                 if let Some(step) = self.stage.steps(robot).iter().min_by_key(|step| step.nanos.abs_diff(nanos)) {
-                    self.truth.insert(submap.frame.clone(), step.t_world_body * slam.t_frame_body(step).inverse());
+                    self.truth.insert(submap.frame.clone(), slam.t_world_frame(step, self.stage.unit_m(robot)));
                 }
             }
         }

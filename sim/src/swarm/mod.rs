@@ -29,7 +29,7 @@ use crate::stage::{Stage, StageError};
 use merganser_protocol::agent::StartError;
 use merganser_protocol::agent::io::{Channel, Event as Told, JobId, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
-use merganser_protocol::geometry::Se3;
+use merganser_protocol::geometry::Sim3;
 use merganser_protocol::ids::{NameError, RobotId};
 use merganser_protocol::time::Instant;
 use robot::{Robot, Slam, identities};
@@ -74,7 +74,7 @@ pub struct Swarm<C> {
     standin: Option<StandIn>,
     trace: Trace,
     counts: FaultCounts,
-    truth: BTreeMap<String, Se3>,
+    truth: BTreeMap<String, Sim3>,
     told: Vec<(f64, usize, Told)>,
     stopwatch: Stopwatch,
     violation: Option<Violation>,
@@ -114,8 +114,8 @@ pub struct Outcome<C> {
     pub robots: Vec<RobotSample>,
     /// Messages by kind, for each robot of the scenario.
     pub usage: Vec<BTreeMap<&'static str, Usage>>,
-    /// `t_world_frame` of every frame.
-    pub truth: BTreeMap<String, Se3>,
+    /// `t_world_frame` of every frame; the scale is its unit, m.
+    pub truth: BTreeMap<String, Sim3>,
     /// What the agents told people: seconds, robot, event.
     pub told: Vec<(f64, usize, Told)>,
     /// Where the wall time went.

@@ -4,15 +4,17 @@ use super::store::Store;
 use crate::scenario::{MachineOptions, Scenario};
 use crate::stage::Stage;
 use crate::world::drive::Step;
+use crate::world::landmarks::Sightings;
 use ed25519_dalek::SigningKey;
 use merganser_protocol::agent::Identity;
 use merganser_protocol::agent::io::{QueryId, Record};
-use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3};
+use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, Sim3, So3};
 use merganser_protocol::ids::{Name, NameError, RobotId};
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::{Instant, Stamp};
 use merganser_store::Owner;
 use merganser_store::simulated::Picture;
+use nalgebra::Vector3;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -245,13 +247,19 @@ impl Slam {
         begun.map_or(step.t_frame_body, |(_, t_drive_frame)| t_drive_frame.inverse() * step.t_frame_body)
     }
 
+    /// Where the frame of that time lies, by this step, if its unit is `unit_m`.
+    pub fn t_world_frame(&self, step: &Step, unit_m: f64) -> Sim3 {
+        let unit = Sim3::new(So3::identity(), Vector3::zeros(), unit_m);
+        Sim3::from_se3(&step.t_world_body) * unit * Sim3::from_se3(&self.t_frame_body(step).inverse())
+    }
+
     /// The agent will not see this keyframe: its motion belongs to the next one.
     pub fn skip(&mut self, step: &Step) {
         self.motion = Some(self.motion_with(step));
     }
 
     /// The keyframe as the agent gets it.
-    pub fn keyframe(&mut self, step: &Step, points: Vec<[f32; 3]>) -> Result<Keyframe, CovarianceError> {
+    pub fn keyframe(&mut self, step: &Step, seen: Sightings) -> Result<Keyframe, CovarianceError> {
         let mut motion = self.motion_with(step);
         self.motion = None;
         if core::mem::take(&mut self.restart) {
@@ -261,12 +269,13 @@ impl Slam {
         let pose = self.t_frame_body(step);
         let stamp = self.stamp_offset.saturating_add_unsigned(step.nanos);
         self.stamps.insert(stamp, step.nanos);
+        let (points, marks) = seen;
         Ok(Keyframe {
             stamp: Stamp(stamp),
             pose: PoseWithCovariance { pose, covariance: motion.covariance },
             covariance_of: CovarianceOf::Motion,
             points,
-            marks: Vec::new(),
+            marks,
         })
     }
 
@@ -307,7 +316,7 @@ mod tests {
     use super::*;
 
     fn step(k: u64) -> Step {
-        let pose = |x: f64| Se3::new(merganser_protocol::geometry::So3::identity(), [x, 0.0, 0.0].into());
+        let pose = |x: f64| Se3::new(So3::identity(), [x, 0.0, 0.0].into());
         let covariance = Covariance::from_sigmas([0.1; 6]).unwrap();
         let motion = PoseWithCovariance { pose: pose(1.0), covariance };
         Step { nanos: k * 1_000_000_000, t_world_body: pose(k as f64), motion, t_frame_body: pose(k as f64) }
@@ -316,11 +325,11 @@ mod tests {
     #[test]
     fn a_keyframe_answers_for_the_motion_of_those_that_were_missed() {
         let mut slam = Slam::new(-5.5);
-        let one = slam.keyframe(&step(1), Vec::new()).unwrap();
+        let one = slam.keyframe(&step(1), Sightings::default()).unwrap();
         slam.skip(&step(2));
         slam.skip(&step(3));
-        let four = slam.keyframe(&step(4), Vec::new()).unwrap();
-        let five = slam.keyframe(&step(5), Vec::new()).unwrap();
+        let four = slam.keyframe(&step(4), Sightings::default()).unwrap();
+        let five = slam.keyframe(&step(5), Sightings::default()).unwrap();
         let variance = |k: &Keyframe| k.pose.covariance.matrix()[(0, 0)];
         assert!((variance(&four) - 3.0 * variance(&one)).abs() < 1e-12);
         assert_eq!(variance(&five), variance(&one));
@@ -331,9 +340,9 @@ mod tests {
     #[test]
     fn a_restarted_slam_begins_at_the_identity() {
         let mut slam = Slam::new(0.0);
-        slam.keyframe(&step(1), Vec::new()).unwrap();
+        slam.keyframe(&step(1), Sightings::default()).unwrap();
         slam.restart();
-        assert_eq!(slam.keyframe(&step(2), Vec::new()).unwrap().pose.pose, Se3::identity());
-        assert_eq!(slam.keyframe(&step(3), Vec::new()).unwrap().pose.pose.translation.x, 1.0);
+        assert_eq!(slam.keyframe(&step(2), Sightings::default()).unwrap().pose.pose, Se3::identity());
+        assert_eq!(slam.keyframe(&step(3), Sightings::default()).unwrap().pose.pose.translation.x, 1.0);
     }
 }

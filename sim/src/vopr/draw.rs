@@ -48,6 +48,7 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
     let duration_secs = dice.range(25.0, 70.0);
     let solve = dice.chance(SOLVE_SHARE);
     let mut scenario = Scenario {
+        landmarks: None,
         name: format!("vopr-{seed}"),
         about: "drawn from the seed".into(),
         robots,

@@ -52,10 +52,24 @@ pub struct Step {
     pub nanos: u64,
     /// The truth.
     pub t_world_body: Se3,
-    /// Motion since the keyframe before, as measured, and the covariance it was drawn from.
+    /// Motion since the keyframe before, as measured, and the covariance it was drawn from, in the SLAM's unit.
     pub motion: PoseWithCovariance,
-    /// The motions chained: the body in the SLAM's frame, which begins at the first keyframe.
+    /// The motions chained: the body in the SLAM's frame and unit, which begins at the first keyframe.
     pub t_frame_body: Se3,
+}
+
+impl Step {
+    /// The same, measured by a SLAM that takes `unit_m` for one.
+    ///
+    /// # Errors
+    /// [`CovarianceError`] if no covariance can be so small, or so large.
+    pub fn in_units(self, unit_m: f64) -> Result<Self, CovarianceError> {
+        let scaled = |t: &Se3| Se3::new(t.rotation, t.translation / unit_m);
+        let per_unit = Vector6::from_fn(|k, _| if k < 3 { 1.0 / unit_m } else { 1.0 });
+        let covariance = self.motion.covariance.matrix().component_mul(&(per_unit * per_unit.transpose()));
+        let motion = PoseWithCovariance { pose: scaled(&self.motion.pose), covariance: Covariance::new(covariance)? };
+        Ok(Self { motion, t_frame_body: scaled(&self.t_frame_body), ..self })
+    }
 }
 
 /// The keyframes of one robot's drive along `path`, for `secs` seconds or to its end.

@@ -6,6 +6,7 @@
 pub mod drive;
 mod generate;
 mod grid;
+pub mod landmarks;
 pub mod path;
 pub mod sensor;
 pub mod shape;

@@ -137,7 +137,7 @@ fn sample(world: World, seed: u64) -> anyhow::Result<Sample> {
         anyhow::bail!("{} at {:.1} s: {}", violation.invariant, violation.at_secs, violation.what);
     }
     let snapshot = outcome.robots.first().and_then(|robot| robot.snapshot.as_ref()).context("no robot is left")?;
-    let t_world_own = *outcome.truth.get(&snapshot.frames.own).context("a frame without truth")?;
+    let t_world_own = outcome.truth.get(&snapshot.frames.own).context("a frame without truth")?.to_se3();
     Ok(Sample {
         frames: mean(frames(&outcome, snapshot, &t_world_own)?)?,
         submaps: mean(submaps(&outcome, snapshot, &t_world_own)?)?,
@@ -152,7 +152,7 @@ fn frames(outcome: &Outcome<Agent>, snapshot: &Snapshot, t_world_own: &Se3) -> a
     let of = |frame: &merganser_protocol::snapshot::FrameView| {
         let t_world_frame = outcome.truth.get(&frame.frame).context("a frame without truth")?;
         let relation = frame.t_own_frame.as_ref().with_context(|| format!("{} is not merged", frame.frame))?;
-        nees(relation, &(t_world_own.inverse() * *t_world_frame)).context("not rigid")
+        Ok(nees(relation, &(t_world_own.inverse() * t_world_frame.to_se3())))
     };
     others.map(of).collect()
 }
@@ -163,7 +163,7 @@ fn submaps(outcome: &Outcome<Agent>, snapshot: &Snapshot, t_world_own: &Se3) -> 
     let others = all.iter().filter(|anchor| anchor.robot != 0 || anchor.index != 0);
     let of = |anchor: &crate::bench::anchors::Anchor| {
         let relation = anchor.t_own_anchor.as_ref().with_context(|| format!("{} is not merged", anchor.name))?;
-        nees(relation, &(t_world_own.inverse() * anchor.t_world_anchor)).context("not rigid")
+        Ok(nees(relation, &(t_world_own.inverse() * anchor.t_world_anchor)))
     };
     others.map(of).collect()
 }
@@ -183,7 +183,7 @@ fn live(outcome: &Outcome<Agent>, snapshot: &Snapshot, t_world_own: &Se3) -> any
         });
         let t_world_body = step.context("a robot that never drove")?.t_world_body;
         let relation = view.t_own_body.as_ref().with_context(|| format!("{} is not merged", view.robot))?;
-        nees(relation, &(t_world_own.inverse() * t_world_body)).context("not rigid")
+        Ok(nees(relation, &(t_world_own.inverse() * t_world_body)))
     };
     snapshot.poses.robots.iter().map(of).collect()
 }
