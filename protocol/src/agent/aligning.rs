@@ -179,7 +179,9 @@ impl Agent {
             return false;
         }
         let scale = self.knowledge.submap(theirs).map_or(ScaleKind::Unknown, |fact| fact.scale);
-        let own_scale = self.config.submap.scale;
+        // Whatever the unit is, within one frame it is the same.
+        let metric =
+            mine.frame == theirs.frame || (self.config.submap.scale, scale) == (ScaleKind::Metric, ScaleKind::Metric);
         let job = AlignJob {
             theirs: keypoints,
             mine: features,
@@ -187,7 +189,7 @@ impl Agent {
             config: self.config.align.clone(),
             voxel_m: self.config.submap.voxel_m,
             sensor: self.config.submap.sensor,
-            scale: if own_scale == ScaleKind::Metric { scale } else { ScaleKind::Unknown },
+            scale: if metric { ScaleKind::Metric } else { ScaleKind::Unknown },
             seed: self.pair_seed(pair_of(mine, theirs)),
         };
         let id = self.run_job(Job::Align(Box::new(job)));

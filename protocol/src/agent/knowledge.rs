@@ -8,7 +8,7 @@ use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::Summary;
 use crate::time::Stamp;
 use crate::wire::fact::{
-    AlignmentFact, CarriedFact, Fact, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
+    AlignmentFact, CarriedFact, Fact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
 };
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -286,10 +286,28 @@ impl Knowledge {
         let gaps =
             posed.into_iter().filter(|(_, chain)| chain.last().is_some_and(|last| *last as usize >= chain.len()));
         Question {
-            problem: MapProblem { frames, alignments, sightings, shares },
+            problem: MapProblem { frames, alignments, sightings, shares, ambiguous: self.ambiguous() },
             alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
             gaps: gaps.collect(),
         }
+    }
+
+    /// Between which frames there are pairs of submaps of which one end found an alignment, and the other that there are
+    /// several; how many.
+    fn ambiguous(&self) -> BTreeMap<(FrameId, FrameId), usize> {
+        let is_ambiguous = |id: &EntryId| {
+            let verdict = self.alignments.get(id).and_then(|fact| self.verdict(*id, fact));
+            verdict.is_some_and(|v| v.outcome == VerdictOutcome::Refused(RefusalReason::Ambiguous))
+        };
+        let mut counts = BTreeMap::new();
+        for ((i, j), ids) in &self.by_pair {
+            let (a, b) = (i.frame.min(j.frame), i.frame.max(j.frame));
+            let agreed = ids.iter().any(|id| self.agreement(*id) == Agreement::Agreed);
+            if a != b && !agreed && ids.iter().any(is_ambiguous) {
+                *counts.entry((a, b)).or_default() += 1;
+            }
+        }
+        counts
     }
 
     /// Whether a LiDAR saw the submap, by its owner's word.
@@ -425,6 +443,29 @@ mod tests {
         // A third party cannot state an alignment of others.
         let foreign = (entry(3, 0), alignment(1, 2, 3.0, 0.02));
         assert!(knowledge(&[foreign]).alignments().next().is_none());
+    }
+
+    #[test]
+    fn an_endpoint_that_sees_two_ways_tells_of_its_two_frames() {
+        let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
+        let refused = |robot: u8, reason| {
+            let outcome = VerdictOutcome::Refused(reason);
+            (entry(robot, 2), Fact::Verdict(VerdictFact { alignment: stated.0, outcome }))
+        };
+        let count = |facts: &[(EntryId, Fact)]| problem(&knowledge(facts)).ambiguous;
+        let both = BTreeMap::from([((frame(1), frame(2)), 1)]);
+        assert_eq!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous)]), both);
+        assert!(count(&[stated.clone(), refused(2, RefusalReason::NoConsensus)]).is_empty());
+        // Neither the writer nor anybody else can say so in its place.
+        assert!(count(&[stated.clone(), refused(1, RefusalReason::Ambiguous)]).is_empty());
+        assert!(count(&[stated.clone(), refused(3, RefusalReason::Ambiguous)]).is_empty());
+        // The same two submaps once more: agreed after all, or no more than one pair.
+        let again = (entry(2, 3), alignment(1, 2, 3.0, 0.02));
+        let answer = |outcome| (entry(1, 3), Fact::Verdict(VerdictFact { alignment: again.0, outcome }));
+        let twice = answer(VerdictOutcome::Refused(RefusalReason::Ambiguous));
+        assert_eq!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous), again.clone(), twice]), both);
+        let agreed = (entry(1, 3), verdict(again.0, 3.0, 0.02));
+        assert!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous), again.clone(), agreed]).is_empty());
     }
 
     #[test]

@@ -46,6 +46,7 @@ pub(super) struct Chain {
 pub(super) struct Intake {
     pub(super) chains: BTreeMap<FrameId, Chain>,
     pub(super) unknown_scale: BTreeSet<FrameId>,
+    pub(super) ambiguous: BTreeMap<(FrameId, FrameId), usize>,
     pub(super) edges: Vec<EdgeEstimate>,
 }
 
@@ -55,7 +56,8 @@ impl Intake {
         let chains: BTreeMap<_, _> = problem.frames.iter().filter_map(chain).collect();
         let unknown = problem.frames.iter().filter(|(_, c)| c.scale == ScaleKind::Unknown);
         let unknown_scale = unknown.map(|(&f, _)| f).collect();
-        let mut intake = Self { chains, unknown_scale, edges: Vec::new() };
+        let ambiguous = problem.ambiguous.clone();
+        let mut intake = Self { chains, unknown_scale, ambiguous, edges: Vec::new() };
         let alignments = sorted(&problem.alignments).into_iter().map(|m| (Kind::Alignment, m));
         let sightings = sorted(&problem.sightings).into_iter().map(|m| (Kind::Sighting, m));
         let (mut entries, mut submaps) = (BTreeSet::new(), BTreeMap::new());

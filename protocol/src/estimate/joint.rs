@@ -61,6 +61,9 @@ pub struct MapProblem {
     /// common with those of other pairs of frames: over 0 to 1, at least `SHARE_MIN` (1e-6); 1 for what is not
     /// listed.
     pub shares: BTreeMap<EntryId, f64>,
+    /// Between two frames, `a < b`: pairs of submaps of which one end found an alignment, and the other end that there are
+    /// several. Places that repeat themselves show by it.
+    pub ambiguous: BTreeMap<(FrameId, FrameId), usize>,
 }
 
 /// Why a measurement does not count.

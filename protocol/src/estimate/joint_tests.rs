@@ -261,6 +261,44 @@ fn frames_of_unknown_unit_merge_in_sim3_with_an_honest_covariance() {
     assert!((0.9..=1.1).contains(&anees), "{anees}");
 }
 
+/// Five alignments agree, and so many pairs of submaps could lie here or there.
+#[test]
+fn frames_of_places_that_repeat_themselves_are_ambiguous() {
+    let rng = &mut rng(41);
+    let mut world = World::new(rng, 3, 12, false);
+    world.align_all(rng, 5, false);
+    let status = |ambiguous: &[((u8, u8), usize)]| {
+        let ambiguous = ambiguous.iter().map(|&((a, b), n)| ((frame(a), frame(b)), n)).collect();
+        let map = solve_map(&MapProblem { ambiguous, ..world.problem.clone() }, &EstimateConfig::default());
+        map.pairs().iter().map(|pair| (pair.status, pair.used)).collect::<Vec<_>>()
+    };
+    let (merged, ambiguous) = ((PairStatus::Merged, 5), (PairStatus::Ambiguous, 0));
+    assert_eq!(status(&[]), [merged; 3]);
+    assert_eq!(status(&[((0, 1), 3)]), [merged; 3]);
+    // Nobody else's business.
+    assert_eq!(status(&[((0, 1), 4), ((0, 2), 3)]), [ambiguous, merged, merged]);
+}
+
+/// Two frames in metres that only one of unknown unit ties together: to it they have one and the same scale.
+#[test]
+fn frames_in_metres_share_the_metre_whoever_joins_them() {
+    for seed in 0..30 {
+        let rng = &mut rng(4000 + seed);
+        let between = (seed % 3) as u8;
+        let unit = libm::exp(0.7 * normal(rng));
+        let scales: Vec<_> = (0..3).map(|robot| (robot == between).then_some(unit)).collect();
+        let mut world = World::scaled(rng, &scales, 12, false);
+        let [a, b] = [(between + 1) % 3, (between + 2) % 3].map(frame);
+        [a, b].iter().for_each(|&metric| world.align(rng, metric, frame(between), 4, false));
+        let map = world.solve();
+        let scale = |metric| map.frame(metric, frame(between)).map(|t| t.sim().scale);
+        let (Some(of_a), Some(of_b)) = (scale(a), scale(b)) else { panic!("{seed}: not merged") };
+        assert!((of_a / of_b - 1.0).abs() < 1e-12, "{seed}: {of_a} and {of_b}");
+        assert!((of_a / unit - 1.0).abs() < 0.1, "{seed}: {of_a} of {unit}");
+        assert!(map.frame(a, b).unwrap().metric().is_some());
+    }
+}
+
 #[test]
 fn false_alignments_never_merge_frames_wrongly() {
     let (runs, mut wrong, mut right, mut false_used, mut true_lost) = (150, 0, 0, 0, 0);

@@ -15,8 +15,12 @@ use thiserror::Error;
 
 /// Of the matches by label, at least this share agrees: where more lie, all are doubted.
 const LABELS_AGREE_MIN: f64 = 0.6;
-/// The second nearest descriptor differs in so many times the bits of the nearest.
-const DISTINCT: f64 = 1.25;
+/// Landmarks that one may be, by their looks. More than one, so that where a place repeats itself each repetition is found,
+/// and the answer is that it does.
+const LOOK_ALIKES_MAX: usize = 4;
+/// A second pose with this share of the support of the first makes the answer ambiguous: descriptors do not agree on a pose
+/// by chance, so it tells that the place repeats itself, and which repetition is seen is then anyone's guess.
+const RIVAL_RATIO_IN_SPACE: f64 = 0.1;
 /// Landmarks that lie in a plane to within so many times their noise look the same in a mirror.
 const FLAT_SIGMAS: f64 = 3.0;
 /// The noise scale may exceed the stated one by this factor.
@@ -187,8 +191,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &LandmarkConfig) ->
     Ok(aligned)
 }
 
-/// Landmarks of one label, if only one on either side has it; and of those without a label, each other's nearest by
-/// descriptor. Best first.
+/// Landmarks of one label, if only one on either side has it; and those without a label that look alike. Best first.
 fn pairings<'a>(theirs: &'a [Landmark], mine: &'a [Landmark]) -> Vec<Pairing<'a>> {
     let (their_labels, my_labels) = (unique(theirs), unique(mine));
     let by_label = their_labels.iter().filter_map(|(label, theirs)| {
@@ -198,14 +201,13 @@ fn pairings<'a>(theirs: &'a [Landmark], mine: &'a [Landmark]) -> Vec<Pairing<'a>
     let mut pairings: Vec<Pairing> = by_label.collect();
     let bare = |all: &'a [Landmark]| -> Vec<&'a Landmark> { all.iter().filter(|l| l.mark.label.is_none()).collect() };
     let (bare_theirs, bare_mine) = (bare(theirs), bare(mine));
-    let forth: Vec<Option<(usize, u32)>> = bare_theirs.iter().map(|l| nearest(l, &bare_mine)).collect();
-    let back: Vec<Option<(usize, u32)>> = bare_mine.iter().map(|l| nearest(l, &bare_theirs)).collect();
-    for (t, found) in forth.iter().enumerate() {
-        if let Some((m, bits)) = *found
-            && back[m].is_some_and(|(b, _)| b == t)
-        {
-            let score = 1.0 / (1.0 + f64::from(bits));
-            pairings.push(Pairing { theirs: bare_theirs[t], mine: bare_mine[m], labelled: false, score });
+    let back: Vec<Vec<(u32, usize)>> = bare_mine.iter().map(|l| alike(l, &bare_theirs)).collect();
+    for (t, theirs) in bare_theirs.iter().enumerate() {
+        for (bits, m) in alike(theirs, &bare_mine) {
+            if back[m].iter().any(|&(_, b)| b == t) {
+                let score = 1.0 / (1.0 + f64::from(bits));
+                pairings.push(Pairing { theirs, mine: bare_mine[m], labelled: false, score });
+            }
         }
     }
     pairings.sort_by(|a, b| b.score.total_cmp(&a.score));
@@ -227,23 +229,19 @@ fn unique(landmarks: &[Landmark]) -> BTreeMap<u32, &Landmark> {
     all
 }
 
-/// Which of `others` looks most like the landmark, clearly more so than the next, and in how many bits it differs.
-fn nearest(landmark: &Landmark, others: &[&Landmark]) -> Option<(usize, u32)> {
-    let own = landmark.mark.descriptor?;
-    let mut best: Option<(usize, u32)> = None;
-    let mut second = u32::MAX;
+/// Those of `others` that look most like the landmark, and in how many bits they differ; nearest first.
+fn alike(landmark: &Landmark, others: &[&Landmark]) -> Vec<(u32, usize)> {
+    let Some(own) = landmark.mark.descriptor else { return Vec::new() };
+    let mut found: Vec<(u32, usize)> = Vec::new();
     for (k, other) in others.iter().enumerate() {
         let Some(descriptor) = &other.mark.descriptor else { continue };
         let bits = differing(&own, descriptor);
-        match best {
-            Some((_, least)) if bits >= least => second = second.min(bits),
-            _ => {
-                second = best.map_or(u32::MAX, |(_, least)| least);
-                best = Some((k, bits));
-            }
+        if bits <= BITS_MAX && (found.len() < LOOK_ALIKES_MAX || found.last().is_some_and(|&(most, _)| bits < most)) {
+            found.truncate(LOOK_ALIKES_MAX - 1);
+            found.insert(found.partition_point(|&(b, _)| b <= bits), (bits, k));
         }
     }
-    best.filter(|(_, bits)| *bits <= BITS_MAX && f64::from(second) >= DISTINCT * f64::from(*bits).max(1.0))
+    found
 }
 
 /// Refuses where too few of the labels agree.
@@ -324,7 +322,7 @@ fn spatial(pairings: &[Pairing], ratio: f64, config: &LandmarkConfig) -> Result<
     let stated = typical(|p| p.theirs).max(typical(|p| p.mine));
     let coarser = if config.solver.model == Model::Rigid { 1.0 } else { ratio.max(1.0) };
     let sigma_max = (coarser * config.solver.sigma_max).max(SIGMA_FACTOR * stated);
-    let solver = SolverConfig { sigma_max, ..config.solver.clone() };
+    let solver = SolverConfig { sigma_max, rival_ratio: RIVAL_RATIO_IN_SPACE, ..config.solver.clone() };
     let problem = Problem {
         source: &source,
         target: &target,

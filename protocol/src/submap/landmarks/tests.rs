@@ -208,6 +208,38 @@ fn lies_are_refused() {
     }
 }
 
+/// Theirs shows one of two bays that look the same, mine shows both: whichever it is, nobody can tell. Alone among other
+/// things, what looks alike does no harm.
+#[test]
+fn what_repeats_itself_is_ambiguous_and_a_few_look_alikes_are_not() {
+    let mut dice = Dice::seed_from_u64(9);
+    let look = |frame| Look { frame, sigma: 0.02, labelled: false, flat: false };
+    let copy = |thing: &Thing, to: Vector3<f64>| Thing { at: to, descriptor: thing.descriptor };
+    for trial in 0..100 {
+        let mut things = world(&mut dice, 60, 4.0, false);
+        let other_bay: Vec<Thing> = things.iter().map(|t| copy(t, t.at + Vector3::new(9.0, 0.0, 0.0))).collect();
+        let frames = [0, 1].map(|_| frame(&mut dice, 1.0));
+        let theirs = look(frames[1]).at(&mut dice, &things, 0..60);
+        let alone = look(frames[0]).at(&mut dice, &things, 0..60);
+        // Of the other bay less is seen.
+        let seen = dice.random_range(30..60);
+        let rest = look(frames[0]).at(&mut dice, &other_bay, 0..seen);
+        let both: Vec<Landmark> = alone.iter().chain(&rest).copied().collect();
+        // A third of all looks like something elsewhere, each at a place of its own.
+        (0..20).for_each(|k| things[40 + k].descriptor = things[k].descriptor);
+        let strewn = [0, 1].map(|k| look(frames[k]).at(&mut dice, &things, 0..60));
+        for config in [any_scale(), in_space(Model::Rigid)] {
+            let answer = register(&offered(&theirs, 0.1), &kept(&both, 0.1), &config);
+            assert!(matches!(answer, Err(LandmarkError::Ambiguous { .. })), "{trial}: {answer:?}");
+            assert!(register(&offered(&theirs, 0.1), &kept(&alone, 0.1), &config).is_ok(), "{trial}");
+            let [mine, theirs] = &strewn;
+            let answer = register(&offered(theirs, 0.1), &kept(mine, 0.1), &config).unwrap();
+            let off = (frames[0] * frames[1].inverse()).inverse() * answer.t_mine_theirs.sim();
+            assert!(off.rotation.angle() < 0.05 && off.translation.norm() < 0.2, "{trial}: {off:?}");
+        }
+    }
+}
+
 /// What geometry cannot tell is refused with its reason.
 #[test]
 fn poor_constellations_are_refused() {
