@@ -261,6 +261,22 @@ fn frames_of_unknown_unit_merge_in_sim3_with_an_honest_covariance() {
     assert!((0.9..=1.1).contains(&anees), "{anees}");
 }
 
+/// However often one submap is asked, it is one place, and may be another that looks the same.
+#[test]
+fn what_one_submap_says_merges_no_frames() {
+    let rng = &mut rng(43);
+    let mut world = World::new(rng, 2, 12, false);
+    for k in [1, 4, 7, 10] {
+        let t = world.measure(Some(&mut *rng), submap(0, 3), submap(1, k));
+        world.state(submap(0, 3), submap(1, k), t);
+    }
+    assert_eq!(world.solve().pairs()[0].status, PairStatus::Provisional);
+    let t = world.measure(Some(rng), submap(0, 8), submap(1, 4));
+    world.state(submap(0, 8), submap(1, 4), t);
+    let map = world.solve();
+    assert_eq!((map.pairs()[0].status, map.pairs()[0].used), (PairStatus::Merged, 5));
+}
+
 /// Five alignments agree, and so many pairs of submaps could lie here or there.
 #[test]
 fn frames_of_places_that_repeat_themselves_are_ambiguous() {

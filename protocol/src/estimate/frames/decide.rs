@@ -7,7 +7,7 @@ use super::evidence::Evidence;
 use super::explain::Explanation;
 use super::gate;
 use super::hypothesis::Hypothesis;
-use super::measured::Measured;
+use super::measured::{Alignment, Measured};
 use super::pairs::Pairs;
 use super::scaled::Scaled;
 use crate::geometry::Covariance;
@@ -19,6 +19,8 @@ const REACH: f64 = 1.3;
 /// Doubtful members leave the answer open if the other frame's map is to be expected off, should they be false, by more
 /// than this share of an alignment's reach.
 const RISK_MAX: f64 = 0.15;
+/// Submaps on either side that the alignments of merged frames tie.
+const SUBMAPS_MIN: usize = 2;
 /// Too few or too weak to merge are shown below this: chance does as well in one case of ten.
 const SHOWN_LOG10_NFA_MAX: f64 = -1.0;
 
@@ -46,12 +48,25 @@ impl<const N: usize, G: Scaled<N>> Measured<'_, N, G> {
         let shown = best.log10_nfa <= SHOWN_LOG10_NFA_MAX || 2 * used > n;
         match best.lacks_scale(self) {
             Some(log_scale_sigma) if significant || shown => FrameOutcome::BaselineTooShort { log_scale_sigma },
-            None if certain && used >= self.config.alignments_min && (significant || n == 1) => {
+            None if certain && self.suffices(best.set) && (significant || n == 1) => {
                 FrameOutcome::Merged(best.consensus(self))
             }
             None if shown => FrameOutcome::Provisional(best.consensus(self)),
             _ => FrameOutcome::Inconsistent,
         }
+    }
+
+    /// As many as are wanted, and, where one alone would not do, of more than one submap on either side: what one submap
+    /// alone says, however often it is asked, may be said of a place that only looks the same.
+    fn suffices(&self, set: Set) -> bool {
+        let distinct = |of: fn(&Alignment<N, G>) -> usize| {
+            let mut submaps: Vec<usize> = clique::vertices(set).map(|k| of(&self.alignments[k])).collect();
+            submaps.sort_unstable();
+            submaps.dedup();
+            submaps.len()
+        };
+        let wanted = self.config.alignments_min;
+        set.count_ones() as usize >= wanted && distinct(|x| x.i).min(distinct(|x| x.j)) >= wanted.min(SUBMAPS_MIN)
     }
 
     /// `best` without its doubtful members, and that it is certain; or with them, and that it is not, where too few would be
