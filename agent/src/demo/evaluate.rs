@@ -1,19 +1,26 @@
 //! Is the merged map right, and does it know how right it is? Every frame alignment is compared with the truth of the
 //! recordings: error e = log(t_true⁻¹ t_estimated), and NEES = eᵀ Σ⁻¹ e with the covariance the robots state (of the local
-//! perturbation, MATH §1), which is χ²₆ if the covariance is honest. All functions here are pure.
+//! perturbation, MATH §1), which is χ²₆ if the covariance is honest; χ²₇ where a robot's unit is unknown, and the error has a
+//! scale. All functions here are pure.
 
 use super::track::Track;
 use super::trajectory::{self, Corrected, TrajectoryError};
-use super::views::{Views, relation};
-use merganser_protocol::geometry::{PoseWithCovariance, Se3};
+use super::views::{Views, relative};
+use merganser_protocol::geometry::{Relative, Sim3};
 use merganser_protocol::snapshot::PairStatus;
-use nalgebra::Vector6;
+use nalgebra::SVector;
 
 /// χ²₆ at 95 %: one honest error in twenty lies outside.
 pub const CHI2_6_95: f64 = 12.591_587_243_743_977;
 /// χ²₆ at 99.9 %: an error outside is no accident.
 pub const CHI2_6_999: f64 = 22.457_744_484_825_33;
-/// Estimates of different robots may differ by this, m and rad.
+/// χ²₇ at 95 %, for similarities...
+pub const CHI2_7_95: f64 = 14.067_140_449_340_169;
+/// ...and at 99.9 %.
+const CHI2_7_999: f64 = 24.321_886_347_856_854;
+/// How far off a scale may be, share.
+const SCALE_OFF_MAX: f64 = 0.05;
+/// Estimates of different robots may differ by this, m (or units), rad and log-scale.
 const SAME: f64 = 1e-6;
 
 /// How large the error of a frame alignment may be.
@@ -42,31 +49,62 @@ impl Bounds {
 /// An estimate's error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseError {
-    /// log(t_true⁻¹ t_estimated), (ρ, φ).
-    pub xi: Vector6<f64>,
+    /// log(t_true⁻¹ t_estimated), (ρ, φ, λ); λ is log-scale, 0 for a rigid estimate.
+    pub xi: SVector<f64, 7>,
     /// Length of the difference of the translations, m.
     pub translation_m: f64,
     /// Angle between the rotations, degrees.
     pub rotation_deg: f64,
+    /// Scale over its true value: 1 for a rigid estimate of frames whose units are the same.
+    pub scale: f64,
     /// ξᵀ Σ⁻¹ ξ.
     pub nees: f64,
+    /// Its degrees of freedom: 6, or 7 for a similarity.
+    pub degrees_of_freedom: usize,
 }
 
 impl PoseError {
-    /// The error of `estimate` (Σ of the local perturbation) against `truth`.
-    pub fn of(estimate: &PoseWithCovariance, truth: &Se3) -> Self {
-        let xi = truth.local(&estimate.pose);
+    /// The error of `estimate` (Σ of the local perturbation) against `truth`, where one is `unit_m` in the frame that both
+    /// map into.
+    pub fn of(estimate: &Relative, truth: &Sim3, unit_m: f64) -> Self {
+        let sim = estimate.sim();
+        let (xi, nees, degrees_of_freedom) = match estimate {
+            Relative::Metric(t) => {
+                let xi = truth.to_se3().local(&t.pose);
+                (xi.push(0.0), t.covariance.mahalanobis_squared(&xi), 6)
+            }
+            Relative::Similarity(t) => {
+                let xi = truth.local(&t.sim);
+                (xi, t.covariance.mahalanobis_squared(&xi), 7)
+            }
+        };
         Self {
             xi,
-            translation_m: (estimate.pose.translation - truth.translation).norm(),
-            rotation_deg: (truth.rotation.inverse() * estimate.pose.rotation).angle().to_degrees(),
-            nees: estimate.covariance.mahalanobis_squared(&xi),
+            translation_m: unit_m * (sim.translation - truth.translation).norm(),
+            rotation_deg: (truth.rotation.inverse() * sim.rotation).angle().to_degrees(),
+            scale: sim.scale / truth.scale,
+            nees,
+            degrees_of_freedom,
         }
     }
 
     /// Whether the truth lies inside the claimed 95 % ellipsoid.
     pub fn inside_95(&self) -> bool {
-        self.nees <= CHI2_6_95
+        self.nees <= if self.degrees_of_freedom == 7 { CHI2_7_95 } else { CHI2_6_95 }
+    }
+
+    /// By how much the scale is off, for people; nothing where both know the metre.
+    pub fn scale_off(&self) -> String {
+        let off = 100.0 * (self.scale - 1.0);
+        if self.degrees_of_freedom == 7 || off.abs() > 1e-6 { format!(", scale {off:+.2} %") } else { String::new() }
+    }
+
+    /// Whether it is within the bounds, scale included, and inside the claimed 99.9 % ellipsoid.
+    fn is_within(&self, bounds: &Bounds) -> bool {
+        self.translation_m <= bounds.translation_m
+            && self.rotation_deg <= bounds.rotation_deg
+            && (self.scale - 1.0).abs() <= SCALE_OFF_MAX
+            && self.nees <= if self.degrees_of_freedom == 7 { CHI2_7_999 } else { CHI2_6_999 }
     }
 }
 
@@ -82,9 +120,9 @@ pub struct Pair {
     /// log₁₀ of the number of false alarms.
     pub log10_nfa: Option<f64>,
     /// `t_a_b`.
-    pub t_a_b: Option<PoseWithCovariance>,
+    pub t_a_b: Option<Relative>,
     /// True `t_a_b`.
-    pub truth: Option<Se3>,
+    pub truth: Option<Sim3>,
     /// Their difference.
     pub error: Option<PoseError>,
 }
@@ -95,7 +133,7 @@ pub struct Pair {
 pub struct Singles {
     /// Alignments whose truth is known.
     pub count: usize,
-    /// Mean NEES; 6 if the covariances are honest.
+    /// Mean NEES; 6 if the covariances are honest. That of similarities counts 6/7.
     pub nees_mean: f64,
     /// Inside their 95 % ellipsoid.
     pub inside_95: usize,
@@ -206,7 +244,7 @@ fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {
             log10_nfa: view.and_then(|view| view.log10_nfa),
             t_a_b,
             truth,
-            error: t_a_b.zip(truth).map(|(estimate, truth)| PoseError::of(&estimate, &truth)),
+            error: t_a_b.zip(truth).zip(a.unit_m).map(|((t, truth), unit_m)| PoseError::of(&t, &truth, unit_m)),
         });
     }
     pairs
@@ -224,10 +262,10 @@ fn singles(tracks: &[Track], views: &[Views]) -> Singles {
     let mut singles = Singles::default();
     for edge in used {
         let truth = t_world_anchor(&edge.i).zip(t_world_anchor(&edge.j));
-        let Some(((i, j), estimate)) = truth.zip(relation(&edge.t_i_j)) else { continue };
-        let error = PoseError::of(&estimate, &(i.inverse() * j));
+        let Some(((i, j), estimate)) = truth.zip(relative(&edge.t_i_j)) else { continue };
+        let error = PoseError::of(&estimate, &(i.inverse() * j), i.scale);
         singles.count += 1;
-        singles.nees_mean += error.nees;
+        singles.nees_mean += error.nees * 6.0 / error.degrees_of_freedom as f64;
         singles.inside_95 += usize::from(error.inside_95());
         singles.translation_rms_m += error.translation_m.powi(2);
         singles.rotation_rms_deg += error.rotation_deg.powi(2);
@@ -267,8 +305,8 @@ fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: &Bounds) ->
         let (held, found) = match &pair.error {
             None => (false, "no alignment of the frames, or no truth".into()),
             Some(e) => (
-                e.translation_m <= *translation_m && e.rotation_deg <= *rotation_deg && e.nees <= CHI2_6_999,
-                format!("{:.3} m, {:.2}°, NEES {:.1}", e.translation_m, e.rotation_deg, e.nees),
+                e.is_within(bounds),
+                format!("{:.3} m, {:.2}°{}, NEES {:.1}", e.translation_m, e.rotation_deg, e.scale_off(), e.nees),
             ),
         };
         checks.push(Check { what, held, found });
@@ -284,7 +322,7 @@ fn difference(views: &[Views]) -> Option<f64> {
         let estimate = |robot: &Views| robot.pair(&views[i].frames.own, &views[j].frames.own)?.1;
         let first = estimate(&views[0])?;
         for robot in views {
-            largest = largest.max(first.pose.local(&estimate(robot)?.pose).amax());
+            largest = largest.max(first.sim().local(&estimate(robot)?.sim()).amax());
         }
     }
     Some(largest)

@@ -13,6 +13,8 @@ pub mod views;
 mod watch;
 
 #[cfg(test)]
+mod scale_tests;
+#[cfg(test)]
 mod tests;
 
 use crate::commands::{runtime, say};

@@ -8,8 +8,8 @@ use super::views::Views;
 use crate::picture;
 use crate::recording::{Recording, ply};
 use anyhow::{Context, Result};
-use merganser_protocol::geometry::{PoseWithCovariance, Se3};
-use nalgebra::Vector3;
+use merganser_protocol::geometry::{Relative, Sim3};
+use nalgebra::{SMatrix, Vector3};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -119,7 +119,7 @@ fn merged_ply(clouds: &[Cloud]) -> Vec<u8> {
 }
 
 /// The TUM format: `stamp x y z qx qy qz qw`, a pose a line.
-fn tum(stamps_secs: &[f64], poses: &[Se3]) -> String {
+fn tum(stamps_secs: &[f64], poses: &[Sim3]) -> String {
     let mut text = String::new();
     for (stamp, pose) in stamps_secs.iter().zip(poses) {
         let ([x, y, z], [qx, qy, qz, qw]) = (<[f64; 3]>::from(pose.translation), pose.rotation.xyzw());
@@ -131,7 +131,8 @@ fn tum(stamps_secs: &[f64], poses: &[Se3]) -> String {
 fn alignments(result: &Outcome) -> Value {
     json!({
         "conventions": "t_a_b maps frame b into frame a; quaternions [x, y, z, w]; tangents and covariances in the order \
-                        (translation, rotation), of the local perturbation T exp(δ); m and rad",
+                        (translation, rotation), for frames of unknown unit (translation, rotation, log-scale), of the \
+                        local perturbation T exp(δ); m (or units of b) and rad",
         "reference_frame": result.views.first().map(|views| &views.frames.own),
         "chi2_6_95": CHI2_6_95,
         "pairs": result.evaluation.pairs.iter().map(pair).collect::<Vec<_>>(),
@@ -150,11 +151,20 @@ fn alignments(result: &Outcome) -> Value {
 
 fn pair(pair: &Pair) -> Value {
     let [proposed, agreed, used] = pair.alignments;
-    let pose = |t: &Se3| json!({"translation": <[f64; 3]>::from(t.translation), "rotation": t.rotation.xyzw()});
-    let estimate = |t: &PoseWithCovariance| {
-        let p = t.covariance.matrix();
-        let rows: Vec<Vec<f64>> = (0..6).map(|r| (0..6).map(|c| p[(r, c)]).collect()).collect();
-        json!({"pose": pose(&t.pose), "covariance": rows, "sigmas": t.covariance.sigmas().as_slice()})
+    let is_similarity = matches!(pair.t_a_b, Some(Relative::Similarity(_)));
+    let pose = |t: &Sim3| {
+        let mut pose = json!({"translation": <[f64; 3]>::from(t.translation), "rotation": t.rotation.xyzw()});
+        if is_similarity {
+            pose["scale"] = json!(t.scale);
+        }
+        pose
+    };
+    let estimate = |t: &Relative| {
+        let (covariance, sigmas): (Vec<Vec<f64>>, Vec<f64>) = match t {
+            Relative::Metric(t) => (rows(t.covariance.matrix()), t.covariance.sigmas().as_slice().to_vec()),
+            Relative::Similarity(t) => (rows(t.covariance.matrix()), t.covariance.sigmas().as_slice().to_vec()),
+        };
+        json!({"pose": pose(&t.sim()), "covariance": covariance, "sigmas": sigmas})
     };
     json!({
         "a": pair.robots[0],
@@ -165,11 +175,15 @@ fn pair(pair: &Pair) -> Value {
         "t_a_b": pair.t_a_b.as_ref().map(estimate),
         "truth": pair.truth.as_ref().map(pose),
         "error": pair.error.map(|e| json!({
-            "xi": e.xi.as_slice(),
+            "xi": &e.xi.as_slice()[..e.degrees_of_freedom],
             "translation_m": e.translation_m,
             "rotation_deg": e.rotation_deg,
             "nees": e.nees,
             "inside_95": e.inside_95(),
         })),
     })
+}
+
+fn rows<const N: usize>(m: &SMatrix<f64, N, N>) -> Vec<Vec<f64>> {
+    (0..N).map(|r| (0..N).map(|c| m[(r, c)]).collect()).collect()
 }

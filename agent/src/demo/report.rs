@@ -1,11 +1,12 @@
 //! What the demonstration prints.
 
-use super::evaluate::{CHI2_6_95, Check, Evaluation, Pair, Singles};
+use super::evaluate::{CHI2_6_95, CHI2_7_95, Check, Evaluation, Pair, Singles};
 use super::track::Track;
 use super::trajectory::TrajectoryError;
 use super::views::Views;
 use crate::recording::Recording;
 use console::style;
+use merganser_protocol::geometry::Relative;
 use merganser_protocol::snapshot::PairStatus;
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -38,11 +39,11 @@ pub(super) fn evaluation(evaluation: &Evaluation, tracks: &[Track]) -> String {
     }
     let errors = evaluation.pairs.iter().filter_map(|pair| pair.error.as_ref());
     let (inside, all) = errors.fold((0, 0), |(inside, all), e| (inside + u32::from(e.inside_95()), all + 1));
+    let similarities = evaluation.pairs.iter().filter_map(|pair| pair.error).any(|e| e.degrees_of_freedom == 7);
+    let bound = if similarities { CHI2_7_95 } else { CHI2_6_95 };
     if all > 0 {
-        let _ = writeln!(
-            text,
-            "  {inside} of {all} errors lie inside their claimed 95 % ellipsoid (NEES ≤ {CHI2_6_95:.3})"
-        );
+        let _ =
+            writeln!(text, "  {inside} of {all} errors lie inside their claimed 95 % ellipsoid (NEES ≤ {bound:.3})");
     }
     let Singles { count, nees_mean, inside_95, translation_rms_m, rotation_rms_deg } = evaluation.singles;
     if count > 0 {
@@ -75,25 +76,35 @@ fn alignment(text: &mut String, pair: &Pair) {
         style(format!("{a} – {b}")).bold()
     );
     let Some(t) = &pair.t_a_b else { return };
-    let (p, r) = (t.pose.translation, t.pose.rotation.log().map(f64::to_degrees));
-    let s = t.covariance.sigmas();
+    let sim = t.sim();
+    let (p, r) = (sim.translation, sim.rotation.log().map(f64::to_degrees));
+    let (s, unit): (Vec<f64>, [&str; 2]) = match t {
+        Relative::Metric(t) => (t.covariance.sigmas().as_slice().to_vec(), ["m"; 2]),
+        Relative::Similarity(t) => (t.covariance.sigmas().as_slice().to_vec(), ["units of a", "units of b"]),
+    };
     let _ = writeln!(
         text,
-        "    translation ({:>8.3}, {:>8.3}, {:>8.3}) m   σ ({:.3}, {:.3}, {:.3}) m",
-        p.x, p.y, p.z, s[0], s[1], s[2]
+        "    translation ({:>8.3}, {:>8.3}, {:>8.3}) {}   σ ({:.3}, {:.3}, {:.3}) {}",
+        p.x, p.y, p.z, unit[0], s[0], s[1], s[2], unit[1]
     );
-    let d = s.map(f64::to_degrees);
+    let d: Vec<f64> = s.iter().copied().map(f64::to_degrees).collect();
     let _ = writeln!(
         text,
         "    rotation    ({:>8.2}, {:>8.2}, {:>8.2}) °   σ ({:.2}, {:.2}, {:.2}) °",
         r.x, r.y, r.z, d[3], d[4], d[5]
     );
+    if let Some(log_sigma) = s.get(6) {
+        let _ = writeln!(text, "    scale       {:>8.4}   σ {:.2} %", sim.scale, 100.0 * log_sigma);
+    }
     let Some(e) = &pair.error else { return };
     let verdict = if e.inside_95() { style("inside").green() } else { style("outside").red() };
     let _ = writeln!(
         text,
-        "    error       {:.3} m, {:.2}°, NEES {:.2}: {verdict} the claimed 95 % ellipsoid",
-        e.translation_m, e.rotation_deg, e.nees
+        "    error       {:.3} m, {:.2}°{}, NEES {:.2}: {verdict} the claimed 95 % ellipsoid",
+        e.translation_m,
+        e.rotation_deg,
+        e.scale_off(),
+        e.nees
     );
 }
 

@@ -6,7 +6,7 @@ use super::trajectory::fit;
 use super::views::Views;
 use super::*;
 use crate::recording::{Drift, Writer, cloud};
-use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
 use merganser_protocol::recording::{CloudFormat, Manifest};
 use merganser_protocol::snapshot::{
     EdgeView, FrameView, FramesView, GraphView, MapView, PairStatus, PairView, PoseView, RelationView, StatsView,
@@ -18,7 +18,7 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::BTreeMap;
 
 const NAMES: [&str; 3] = ["alpha", "beta", "gamma"];
-const BOUNDS: Bounds = Bounds { translation_m: 0.15, rotation_deg: 1.5 };
+pub(super) const BOUNDS: Bounds = Bounds { translation_m: 0.15, rotation_deg: 1.5 };
 /// Keyframes of a robot and of a submap.
 const KEYFRAMES: usize = 12;
 const PER_SUBMAP: usize = 4;
@@ -33,7 +33,7 @@ fn covariance() -> Covariance<6> {
     Covariance::new(a * a.transpose()).unwrap()
 }
 
-fn tracks() -> Vec<Track> {
+pub(super) fn tracks() -> Vec<Track> {
     let drift = Drift { per_metre: 0.02, floor_m: 0.005, step_deg: 0.5 };
     let track = |(index, name): (usize, &&str)| {
         let start = pose([3.0 * index as f64, -1.0, 0.2], [0.1, 0.0, 1.3 * index as f64]);
@@ -44,6 +44,7 @@ fn tracks() -> Vec<Track> {
             name: (*name).into(),
             stamps_secs: (0..KEYFRAMES).map(|k| 0.5 * k as f64).collect(),
             odometry: drift.odometry(&truth, index as u64).unwrap().iter().map(|p| p.pose).collect(),
+            unit_m: Some(1.0),
             truth: Some(truth),
         }
     };
@@ -61,7 +62,7 @@ fn frame(robot: usize) -> String {
 /// What robot `own` would show if its estimate of each pair were the truth disturbed by `error`, and of each anchor the
 /// truth.
 fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
-    let t_world = |robot: usize| tracks[robot].t_world_frame().unwrap();
+    let t_world = |robot: usize| tracks[robot].t_world_frame().unwrap().to_se3();
     let t_a_b = |a: usize, b: usize| (t_world(a).inverse() * t_world(b)).retract(error);
     let pair = |a: usize, b: usize| PairView {
         a: frame(a),
@@ -139,8 +140,12 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
     }
 }
 
-fn all_views(tracks: &[Track], error: &Vector6<f64>) -> Vec<Views> {
+pub(super) fn all_views(tracks: &[Track], error: &Vector6<f64>) -> Vec<Views> {
     (0..3).map(|own| views(tracks, own, error)).collect()
+}
+
+fn rigid_error(pose: Se3, covariance: Covariance<6>, truth: &Se3) -> PoseError {
+    PoseError::of(&Relative::Metric(PoseWithCovariance { pose, covariance }), &Sim3::from_se3(truth), 1.0)
 }
 
 #[test]
@@ -149,12 +154,12 @@ fn a_known_offset_gives_the_known_error() {
     let sigmas = [0.1, 0.2, 0.3, 0.01, 0.02, 0.04];
     let covariance = Covariance::from_sigmas(sigmas).unwrap();
     let shifted = truth * Se3::new(Se3::identity().rotation, Vector3::new(0.3, 0.0, -0.3));
-    let e = PoseError::of(&PoseWithCovariance { pose: shifted, covariance }, &truth);
+    let e = rigid_error(shifted, covariance, &truth);
     assert!((e.translation_m - 0.3 * 2f64.sqrt()).abs() < 1e-12 && e.rotation_deg < 1e-6);
     assert!((e.nees - 10.0).abs() < 1e-9, "3² + 1²: {}", e.nees);
     assert!(e.inside_95());
     let turned = truth * pose([0.0; 3], [0.0, 0.0, 0.16]);
-    let e = PoseError::of(&PoseWithCovariance { pose: turned, covariance }, &truth);
+    let e = rigid_error(turned, covariance, &truth);
     assert!((e.rotation_deg - 0.16f64.to_degrees()).abs() < 1e-9 && e.translation_m < 1e-12);
     assert!((e.nees - 16.0).abs() < 1e-9 && !e.inside_95());
 }
@@ -170,8 +175,7 @@ fn an_honest_estimate_has_nees_of_six_and_lies_inside_in_95_percent() {
     let (mut sum, mut inside) = (0.0, 0);
     for step in steps.windows(2) {
         let n = (step[0].pose.inverse() * step[1].pose).log();
-        let estimate = PoseWithCovariance { pose: truth.retract(&(l * n)), covariance: covariance() };
-        let e = PoseError::of(&estimate, &truth);
+        let e = rigid_error(truth.retract(&(l * n)), covariance(), &truth);
         sum += e.nees / 4000.0;
         inside += u32::from(e.inside_95());
     }
@@ -192,10 +196,10 @@ fn a_true_map_passes_every_check() {
     assert!(errors.alone_m.1 > errors.merged_m.1, "{errors:?}");
     // The anchors are true: only the drift inside each submap is left, and none at an anchor.
     let corrected = evaluation.corrected[1].as_ref().unwrap();
-    let t_ref_world = tracks[0].t_world_frame().unwrap().inverse();
+    let t_ref_world = tracks[0].t_world_frame().unwrap().to_se3().inverse();
     for first in (0..KEYFRAMES).step_by(PER_SUBMAP) {
         let truth = t_ref_world * tracks[1].truth.as_ref().unwrap()[first];
-        assert!(truth.local(&corrected.poses[first]).norm() < 1e-9);
+        assert!(truth.local(&corrected.poses[first].to_se3()).norm() < 1e-9);
     }
     assert_eq!(corrected.anchors.len(), 3);
 }
@@ -332,7 +336,7 @@ fn views_are_read_from_json_and_bad_ones_are_not() {
     assert!(parsed.status == views.status && parsed.stats == views.stats && parsed.map.submaps.len() == 9);
     let t = |views: &Views| views.pair(&frame(2), &frame(0)).unwrap().1.unwrap();
     // JSON numbers may differ in their last digit.
-    assert!(t(&parsed).pose.local(&t(&views).pose).norm() < 1e-12);
+    assert!(t(&parsed).sim().local(&t(&views).sim()).norm() < 1e-12);
     documents.insert("map".into(), b"null".to_vec());
     assert!(Views::parse(&documents).unwrap_err().starts_with("view/map is of another shape"));
     documents.remove("status");

@@ -1,8 +1,8 @@
 //! The robots' paths after merging, in one frame, and their errors.
 
 use super::track::Track;
-use super::views::{Views, pose, relation};
-use merganser_protocol::geometry::{PoseWithCovariance, Se3, So3};
+use super::views::{Views, pose, relative};
+use merganser_protocol::geometry::{Relative, Se3, Sim3, So3};
 use nalgebra::{Matrix3, Vector3};
 
 /// A keyframe belongs to a submap if its stamp lies in the submap's span, widened by this (stamps travel as floats), s.
@@ -11,10 +11,10 @@ const STAMP_SLACK_SECS: f64 = 1e-6;
 /// One robot's path in the frame of the reference robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Corrected {
-    /// `t_ref_body`, one per keyframe.
-    pub poses: Vec<Se3>,
+    /// `t_ref_body`, one per keyframe; the scale is that of the robot's unit.
+    pub poses: Vec<Sim3>,
     /// `t_ref_anchor` of its submaps, in order.
-    pub anchors: Vec<PoseWithCovariance>,
+    pub anchors: Vec<Relative>,
 }
 
 /// Moves a robot's odometry along with its submaps: t_ref_body = t_ref_anchor ∘ t_frame_anchor⁻¹ ∘ t_frame_body with the
@@ -25,21 +25,22 @@ pub fn correct(track: &Track, reference: &Views, frame: &str) -> Option<Correcte
     let mut moves = Vec::new();
     let mut anchors = Vec::new();
     for submap in submaps {
-        let t_ref_anchor = relation(submap.t_own_anchor.as_ref()?)?;
-        moves.push((submap.stamps_secs[0], t_ref_anchor.pose * pose(&submap.t_frame_anchor)?.inverse()));
+        let t_ref_anchor = relative(submap.t_own_anchor.as_ref()?)?;
+        let t_anchor_frame = Sim3::from_se3(&pose(&submap.t_frame_anchor)?.inverse());
+        moves.push((submap.stamps_secs[0], t_ref_anchor.sim() * t_anchor_frame));
         anchors.push(t_ref_anchor);
     }
     let first = moves.first()?.1;
     let poses = track.stamps_secs.iter().zip(&track.odometry).map(|(stamp, t_frame_body)| {
         let begun = moves.iter().take_while(|(start, _)| *start <= stamp + STAMP_SLACK_SECS);
-        begun.last().map_or(first, |(_, t_ref_frame)| *t_ref_frame) * *t_frame_body
+        begun.last().map_or(first, |(_, t_ref_frame)| *t_ref_frame) * Sim3::from_se3(t_frame_body)
     });
     Some(Corrected { poses: poses.collect(), anchors })
 }
 
 /// True `t_world_anchor` of a submap, `name/epoch#index`: the anchor moves with the keyframe it was placed at, the one of
 /// the submap's span whose odometry is the anchor's.
-pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Se3> {
+pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Sim3> {
     let (frame, index) = submap.rsplit_once('#')?;
     let index: u32 = index.parse().ok()?;
     let view = views.map.submaps.iter().find(|view| view.frame == frame && view.index == index)?;
@@ -49,10 +50,11 @@ pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Se3> {
     let inside = (0..track.odometry.len()).filter(|&k| span.contains(&track.stamps_secs[k]));
     let away = |k: usize| t_frame_anchor.local(&track.odometry[k]).norm();
     let at = inside.min_by(|&a, &b| away(a).total_cmp(&away(b)))?;
-    Some(*track.truth.as_ref()?.get(at)? * track.odometry[at].inverse() * t_frame_anchor)
+    Some(track.t_world_frame_at(at)? * Sim3::from_se3(&t_frame_anchor))
 }
 
-/// Root mean square errors of keyframe positions, m.
+/// Root mean square errors of keyframe positions, m. Where units are unknown the first robot's true unit is given with its
+/// true start.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectoryError {
     /// Odometry alone, given the true start of each robot; per robot and of all.
@@ -66,12 +68,12 @@ pub struct TrajectoryError {
 /// The paths' errors; `None` unless every robot merged and every truth is known.
 pub fn errors(tracks: &[Track], corrected: &[Option<Corrected>]) -> Option<TrajectoryError> {
     let t_world_ref = tracks.first()?.t_world_frame()?;
-    let (mut alone, mut merged, mut truths) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut alone, mut merged, mut truths): (Vec<Vec<_>>, Vec<Vec<_>>, Vec<Vec<_>>) = Default::default();
     for (track, corrected) in tracks.iter().zip(corrected) {
         let t_world_frame = track.t_world_frame()?;
-        alone.push(positions(track.odometry.iter().map(|pose| t_world_frame * *pose)));
-        merged.push(positions(corrected.as_ref()?.poses.iter().map(|pose| t_world_ref * *pose)));
-        truths.push(positions(track.truth.as_ref()?.iter().copied()));
+        alone.push(track.odometry.iter().map(|pose| t_world_frame * pose.translation).collect());
+        merged.push(corrected.as_ref()?.poses.iter().map(|pose| t_world_ref * pose.translation).collect());
+        truths.push(track.truth.as_ref()?.iter().map(|pose| pose.translation).collect());
     }
     let fit = fit(&merged.concat(), &truths.concat());
     let fitted = merged.iter().map(|path| path.iter().map(|p| fit * *p).collect()).collect::<Vec<_>>();
@@ -80,10 +82,6 @@ pub fn errors(tracks: &[Track], corrected: &[Option<Corrected>]) -> Option<Traje
         merged_m: errors_of(&merged, &truths),
         fitted_m: errors_of(&fitted, &truths),
     })
-}
-
-fn positions(poses: impl Iterator<Item = Se3>) -> Vec<Vector3<f64>> {
-    poses.map(|pose| pose.translation).collect()
 }
 
 fn errors_of(paths: &[Vec<Vector3<f64>>], truths: &[Vec<Vector3<f64>>]) -> (Vec<f64>, f64) {

@@ -1,10 +1,10 @@
 //! The views of one robot as they are read off Zenoh, and poses out of them.
 
-use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
 use merganser_protocol::snapshot::{
     FramesView, GraphView, MapView, PairView, PoseView, RelationView, StatsView, StatusView,
 };
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::{SMatrix, Vector3};
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 
@@ -43,13 +43,13 @@ impl Views {
     }
 
     /// The pair of these two frames and its `t_a_b`, whichever way round the robot states it.
-    pub fn pair(&self, a: &str, b: &str) -> Option<(&PairView, Option<PoseWithCovariance>)> {
+    pub fn pair(&self, a: &str, b: &str) -> Option<(&PairView, Option<Relative>)> {
         let stated = |a: &str, b: &str| self.frames.pairs.iter().find(|pair| pair.a == a && pair.b == b);
         if let Some(pair) = stated(a, b) {
-            return Some((pair, pair.t_a_b.as_ref().and_then(relation)));
+            return Some((pair, pair.t_a_b.as_ref().and_then(relative)));
         }
         let pair = stated(b, a)?;
-        Some((pair, pair.t_a_b.as_ref().and_then(relation).map(|t| t.inverse())))
+        Some((pair, pair.t_a_b.as_ref().and_then(relative).map(|t| t.inverse())))
     }
 }
 
@@ -60,13 +60,31 @@ pub fn pose(view: &PoseView) -> Option<Se3> {
 
 /// A rigid pose with its covariance; `None` for a similarity.
 pub fn relation(view: &RelationView) -> Option<PoseWithCovariance> {
-    if view.covariance.len() != 21 {
-        return None;
+    match relative(view)? {
+        Relative::Metric(t) => Some(t),
+        Relative::Similarity(_) => None,
     }
-    let mut m = Matrix6::zeros();
-    for ((row, column), value) in (0..6).flat_map(|r| (r..6).map(move |c| (r, c))).zip(&view.covariance) {
+}
+
+/// A relation with its covariance: a similarity where the covariance is one of seven values.
+pub fn relative(view: &RelationView) -> Option<Relative> {
+    let pose = pose(&view.pose)?;
+    if view.covariance.len() == 21 {
+        let covariance = Covariance::new(square::<6>(&view.covariance)).ok()?;
+        return Some(Relative::Metric(PoseWithCovariance { pose, covariance }));
+    }
+    let scale = Some(view.pose.scale).filter(|scale| scale.is_finite() && *scale > 0.0)?;
+    let covariance = Covariance::new((view.covariance.len() == 28).then(|| square::<7>(&view.covariance))?).ok()?;
+    let sim = Sim3::new(pose.rotation, pose.translation, scale);
+    Some(Relative::Similarity(SimWithCovariance { sim, covariance }))
+}
+
+/// The symmetric matrix of a row-major upper triangle.
+fn square<const N: usize>(triangle: &[f64]) -> SMatrix<f64, N, N> {
+    let mut m = SMatrix::zeros();
+    for ((row, column), value) in (0..N).flat_map(|r| (r..N).map(move |c| (r, c))).zip(triangle) {
         m[(row, column)] = *value;
         m[(column, row)] = *value;
     }
-    Some(PoseWithCovariance { pose: pose(&view.pose)?, covariance: Covariance::new(m).ok()? })
+    m
 }

@@ -56,6 +56,8 @@ pub struct Scene {
     pub robots: Vec<Robot>,
     /// Alignments used: the positions of both anchors in the common frame.
     pub alignments: Vec<[Vector3<f64>; 2]>,
+    /// Lengths are metres, not units that nobody knows.
+    pub in_metres: bool,
 }
 
 /// Draws the picture as SVG.
@@ -90,7 +92,7 @@ pub fn draw(scene: &Scene) -> String {
         let width = 7.6 * captions[index].len() as f64 + 20.0;
         svg.rect([x + 6.0, y + 6.0, width, 32.0], PANEL, "rx=\"4\" fill-opacity=\"0.85\"");
         svg.text([x + 16.0, y + 28.0], 17.0, INK, Anchor::Start, captions[index]);
-        scale_bar(&mut svg, &view);
+        scale_bar(&mut svg, &view, scene.in_metres);
     }
     legend(&mut svg, scene, enlargement(scene, &plan, scales[1]));
     svg.finish()
@@ -226,7 +228,7 @@ fn ellipses(svg: &mut Svg, scene: &Scene, view: &View) {
 }
 
 /// A bar of 1, 2 or 5 times a power of ten metres, about a sixth of the panel long.
-fn scale_bar(svg: &mut Svg, view: &View) {
+fn scale_bar(svg: &mut Svg, view: &View, in_metres: bool) {
     let [x, y, w, h] = view.panel;
     let wanted = w / 6.0 / view.scale;
     let decade = 10f64.powf(wanted.log10().floor());
@@ -237,7 +239,11 @@ fn scale_bar(svg: &mut Svg, view: &View) {
     for end in [right - length, right] {
         svg.line(&[[end, bottom - 4.0], [end, bottom + 4.0]], INK, 2.0, "");
     }
-    let label = if metres < 1.0 { format!("{:.0} cm", metres * 100.0) } else { format!("{metres:.0} m") };
+    let label = match metres < 1.0 {
+        _ if !in_metres => format!("{metres} units"),
+        true => format!("{:.0} cm", metres * 100.0),
+        false => format!("{metres:.0} m"),
+    };
     svg.text([right - length / 2.0, bottom - 9.0], 15.0, INK, Anchor::Middle, &label);
 }
 
@@ -317,7 +323,7 @@ mod tests {
         let pairs = robots[0].anchors.iter().zip(&robots[1].anchors);
         let alignments = pairs.map(|(a, b)| [a.0, b.0]).collect();
         let (title, subtitle) = ("A test & its <picture>".into(), "nobody drove".into());
-        Scene { title, subtitle, up: Vector3::z(), robots, alignments }
+        Scene { title, subtitle, up: Vector3::z(), robots, alignments, in_metres: true }
     }
 
     #[test]

@@ -40,6 +40,14 @@ pub enum Problem {
     /// `[config]` holds a value that cannot work.
     #[error("config.{0}")]
     Config(#[from] ConfigError),
+    /// `unit_m` is stated for a SLAM that knows the metre.
+    #[error(
+        "unit_m is for SLAMs that do not know the metre; leave it out, or write scale = \"unknown\" under [config.submap]"
+    )]
+    UnitOfMetres,
+    /// `unit_m` can be none.
+    #[error("unit_m = {0}: state what one is in this recording, 0.001 to 1000 m, or leave it out")]
+    UnitRange(f64),
     /// The first line of a table is not the expected one.
     #[error("the columns are not the expected ones; the first line must be \"{0}\"")]
     Header(&'static str),

@@ -24,8 +24,9 @@ pub use table::{KeyframeLine, TruthLine};
 pub use write::Writer;
 
 use error::on;
-use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, Manifest, VERSION};
+use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, Manifest, UNIT_RANGE_M, VERSION};
 use merganser_protocol::submap::Keyframe;
+use merganser_protocol::wire::fact::ScaleKind;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -169,6 +170,14 @@ fn read_manifest(path: &Path) -> Result<Manifest, RecordingError> {
         return Err(Problem::KeyframesRange(manifest.keyframes).of(path));
     }
     manifest.config.validate().map_err(|error| Problem::Config(error).of(path))?;
+    if let Some(unit_m) = manifest.unit_m {
+        if manifest.config.submap.scale == ScaleKind::Metric {
+            return Err(Problem::UnitOfMetres.of(path));
+        }
+        if !UNIT_RANGE_M.contains(&unit_m) {
+            return Err(Problem::UnitRange(unit_m).of(path));
+        }
+    }
     Ok(manifest)
 }
 

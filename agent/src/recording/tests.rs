@@ -129,6 +129,29 @@ fn bad_manifests_are_told() {
     expect(&with("voxel_m = 0.1", "voxel_m = -1.0"), MANIFEST, None, "config.submap.voxel_m");
     expect(&with("voxel_m = 0.1", "voxel = 0.1"), MANIFEST, Some(12), "voxel");
     expect(&with("format = ", "format == "), MANIFEST, Some(1), "");
+    expect(
+        &with("origin = ", "unit_m = 0.5\norigin = "),
+        MANIFEST,
+        None,
+        "unit_m is for SLAMs that do not know the metre",
+    );
+}
+
+#[test]
+fn a_unit_is_a_length() {
+    let state = |unit: &str, d: &Path| {
+        edit(&d.join(MANIFEST), "origin = ", &format!("unit_m = {unit}\norigin = "));
+        edit(&d.join(MANIFEST), "scale = \"metric\"", "scale = \"unknown\"");
+    };
+    for good_one in ["0.001", "0.7", "1000.0"] {
+        let folder = good();
+        state(good_one, folder.path());
+        let read = Recording::open(folder.path()).unwrap().manifest().unit_m;
+        assert_eq!(read, Some(good_one.parse().unwrap()));
+    }
+    for bad in ["0.000999", "1000.1", "-1.0", "nan", "inf"] {
+        expect(&refused(|d| state(bad, d)), MANIFEST, None, "state what one is in this recording");
+    }
 }
 
 #[test]
