@@ -8,6 +8,7 @@ use super::trajectory::{self, Corrected, TrajectoryError};
 use super::views::{Views, relative};
 use merganser_protocol::geometry::{Relative, Sim3};
 use merganser_protocol::snapshot::PairStatus;
+use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::SVector;
 
 /// χ²₆ at 95 %: one honest error in twenty lies outside.
@@ -20,6 +21,8 @@ pub const CHI2_7_95: f64 = 14.067_140_449_340_169;
 const CHI2_7_999: f64 = 24.321_886_347_856_854;
 /// How far off a scale may be, share.
 const SCALE_OFF_MAX: f64 = 0.05;
+/// Units this close are one unit, share.
+const SAME_UNIT: f64 = 1e-9;
 /// Estimates of different robots may differ by this, m (or units), rad and log-scale.
 const SAME: f64 = 1e-6;
 
@@ -49,7 +52,7 @@ impl Bounds {
 /// An estimate's error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseError {
-    /// log(t_true⁻¹ t_estimated), (ρ, φ, λ); λ is log-scale, 0 for a rigid estimate.
+    /// log(t_true⁻¹ t_estimated), (ρ, φ, λ); λ is log-scale, 0 for a rigid estimate of frames whose units are the same.
     pub xi: SVector<f64, 7>,
     /// Length of the difference of the translations, m.
     pub translation_m: f64,
@@ -59,21 +62,23 @@ pub struct PoseError {
     pub scale: f64,
     /// ξᵀ Σ⁻¹ ξ.
     pub nees: f64,
-    /// Its degrees of freedom: 6, or 7 for a similarity.
+    /// Its degrees of freedom: 6, or 7 where there is a scale to be wrong.
     pub degrees_of_freedom: usize,
 }
 
 impl PoseError {
     /// The error of `estimate` (Σ of the local perturbation) against `truth`, where one is `unit_m` in the frame that both
-    /// map into.
+    /// map into. A rigid estimate claims that the units are the same: where they are not, its error has a scale, too, far
+    /// outside what it claims.
     pub fn of(estimate: &Relative, truth: &Sim3, unit_m: f64) -> Self {
         let sim = estimate.sim();
         let (xi, nees, degrees_of_freedom) = match estimate {
-            Relative::Metric(t) => {
+            Relative::Metric(t) if (truth.scale - 1.0).abs() <= SAME_UNIT => {
                 let xi = truth.to_se3().local(&t.pose);
                 (xi.push(0.0), t.covariance.mahalanobis_squared(&xi), 6)
             }
-            Relative::Similarity(t) => {
+            _ => {
+                let t = estimate.lifted();
                 let xi = truth.local(&t.sim);
                 (xi, t.covariance.mahalanobis_squared(&xi), 7)
             }
@@ -93,10 +98,12 @@ impl PoseError {
         self.nees <= if self.degrees_of_freedom == 7 { CHI2_7_95 } else { CHI2_6_95 }
     }
 
-    /// By how much the scale is off, for people; nothing where both know the metre.
+    /// By how much the scale is off, for people; nothing where there is none.
     pub fn scale_off(&self) -> String {
-        let off = 100.0 * (self.scale - 1.0);
-        if self.degrees_of_freedom == 7 || off.abs() > 1e-6 { format!(", scale {off:+.2} %") } else { String::new() }
+        if self.degrees_of_freedom < 7 {
+            return String::new();
+        }
+        format!(", scale {:+.2} %", 100.0 * (self.scale - 1.0))
     }
 
     /// Whether it is within the bounds, scale included, and inside the claimed 99.9 % ellipsoid.
@@ -293,25 +300,42 @@ fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: &Bounds) ->
     let difference = difference(views);
     let found = difference.map_or("an estimate is absent".into(), |d| format!("{d:.1e} apart"));
     checks.push(check("all robots hold the same estimate", difference.is_some_and(|d| d <= SAME), found));
-    if pairs.iter().all(|pair| pair.truth.is_none()) {
-        return checks;
-    }
-    for pair in pairs {
-        let [a, b] = &pair.robots;
-        let Bounds { translation_m, rotation_deg } = bounds;
-        let what = format!(
-            "{a}–{b}: error at most {translation_m:.2} m and {rotation_deg:.1}°, and inside the 99.9 % ellipsoid"
-        );
-        let (held, found) = match &pair.error {
-            None => (false, "no alignment of the frames, or no truth".into()),
-            Some(e) => (
-                e.is_within(bounds),
-                format!("{:.3} m, {:.2}°{}, NEES {:.1}", e.translation_m, e.rotation_deg, e.scale_off(), e.nees),
-            ),
-        };
-        checks.push(Check { what, held, found });
-    }
+    let truths = pairs.iter().any(|pair| pair.truth.is_some());
+    let of_pair = |((i, j), pair)| pair_check([&tracks[i], &tracks[j]], pair, truths, bounds);
+    checks.extend(indices(tracks.len()).zip(pairs).filter_map(of_pair));
     checks
+}
+
+/// How two frames are related. Where one's unit is unknown that must be a similarity, whatever the units happen to be, and
+/// nobody can say how far off it is unless the recordings state the units.
+fn pair_check(tracks: [&Track; 2], pair: &Pair, truths: bool, bounds: &Bounds) -> Option<Check> {
+    let scaled = tracks.iter().any(|track| track.scale == ScaleKind::Unknown);
+    let judged = truths && tracks.iter().all(|track| track.unit_m.is_some());
+    let [a, b] = &pair.robots;
+    let Bounds { translation_m, rotation_deg } = bounds;
+    let what = match (scaled, judged) {
+        (false, false) => return None,
+        (false, true) => format!(
+            "{a}–{b}: error at most {translation_m:.2} m and {rotation_deg:.1}°, and inside the 99.9 % ellipsoid"
+        ),
+        (true, true) => format!(
+            "{a}–{b}: a similarity, error at most {translation_m:.2} m, {rotation_deg:.1}° and {:.0} % of scale, and \
+             inside the 99.9 % ellipsoid",
+            100.0 * SCALE_OFF_MAX
+        ),
+        (true, false) => format!("{a}–{b}: a similarity; how far off is unknown without unit_m and truth"),
+    };
+    let fits = !scaled || matches!(pair.t_a_b, Some(Relative::Similarity(_)));
+    let kind = if fits { "" } else { "a rigid motion, " };
+    let (held, found) = match (&pair.t_a_b, &pair.error) {
+        (_, Some(e)) => (
+            fits && e.is_within(bounds),
+            format!("{kind}{:.3} m, {:.2}°{}, NEES {:.1}", e.translation_m, e.rotation_deg, e.scale_off(), e.nees),
+        ),
+        (Some(_), None) if !judged => (fits, kind.trim_end_matches(", ").into()),
+        _ => (false, "no alignment of the frames, or no truth".into()),
+    };
+    Some(Check { what, held, found })
 }
 
 /// Largest difference between what the robots estimate of any pair of frames, m or rad; `None` if one of them estimates

@@ -149,9 +149,11 @@ fn prepare(args: &DemoArgs, work: &Path) -> Result<(Vec<Recording>, Bounds)> {
     };
     let recordings = import::prepare(data, &folder, args.seed)?;
     recordings.iter().try_for_each(Recording::check_clouds)?;
-    let longest_m = || recordings.iter().map(|recording| Track::of(recording).driven_m()).fold(0.0, f64::max);
     let bounds = match import::detect(data)? {
-        Kind::Recordings => default.for_drives_of(longest_m()),
+        Kind::Recordings => {
+            let tracks: Vec<Track> = recordings.iter().map(Track::of).collect();
+            default.for_drives_of(track::longest_m(&tracks))
+        }
         Kind::SevenScenes => Bounds { translation_m: 0.05, rotation_deg: 2.0 },
         Kind::Lidar => Bounds { translation_m: 0.75, rotation_deg: 2.0 },
         Kind::Carmen | Kind::Mrclam => Bounds { translation_m: 0.3, rotation_deg: 2.0 },

@@ -1,6 +1,6 @@
 //! The files that the demonstration leaves: the merged map, the robots' paths, the alignments and the picture.
 
-use super::evaluate::{CHI2_6_95, Evaluation, Pair};
+use super::evaluate::{CHI2_6_95, CHI2_7_95, Evaluation, Pair, PoseError};
 use super::scene;
 use super::track::Track;
 use super::trajectory::Corrected;
@@ -9,6 +9,7 @@ use crate::picture;
 use crate::recording::{Recording, ply};
 use anyhow::{Context, Result};
 use merganser_protocol::geometry::{Relative, Sim3};
+use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::{SMatrix, Vector3};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
@@ -21,6 +22,12 @@ const MERGED: &str = "merged.ply";
 const ALIGNMENTS: &str = "alignments.json";
 const PNG: &str = "merge.png";
 const SVG: &str = "merge.svg";
+/// What [`ALIGNMENTS`] says of itself where a robot does not know the metre.
+const SCALED_CONVENTIONS: &str = "t_a_b maps frame b into frame a, p_a = scale R p_b + t, and is rigid where no scale is \
+     stated; quaternions [x, y, z, w]; tangents and covariances in the order (translation, rotation, and log-scale if there \
+     is one), of the local perturbation T exp(δ); translations in units of a, their covariances in units of b, angles in \
+     rad; an error's scale is the estimate over the truth, its translation_m in m; units_m is what one is in each robot's \
+     frame, null if unknown; the merged map and the paths are in units of the reference frame";
 /// The merged map is thinned to one point per robot in cubes of this share of the submaps' voxel.
 const THIN: f64 = 0.5;
 /// Robots' colours, told apart by colour-blind people too (Okabe and Ito).
@@ -91,6 +98,9 @@ pub(super) fn remove_old(folder: &Path) -> Result<()> {
 /// Reads all clouds of a recording, thinned.
 fn cloud(recording: &Recording, corrected: Option<&Corrected>) -> Result<Cloud> {
     let cell = recording.manifest().config.submap.voxel_m * THIN;
+    // The voxel is of the robot's own unit; one size for all its submaps, so that their cubes are the same.
+    let to_common = corrected.and_then(|corrected| corrected.poses.first()).map_or(1.0, |pose| pose.scale);
+    let cell = cell * to_common;
     let mut taken = BTreeSet::new();
     let mut cloud = Cloud::default();
     for (index, line) in recording.keyframes().iter().enumerate() {
@@ -129,10 +139,9 @@ fn tum(stamps_secs: &[f64], poses: &[Sim3]) -> String {
 }
 
 fn alignments(result: &Outcome) -> Value {
-    json!({
+    let mut document = json!({
         "conventions": "t_a_b maps frame b into frame a; quaternions [x, y, z, w]; tangents and covariances in the order \
-                        (translation, rotation), for frames of unknown unit (translation, rotation, log-scale), of the \
-                        local perturbation T exp(δ); m (or units of b) and rad",
+                        (translation, rotation), of the local perturbation T exp(δ); m and rad",
         "reference_frame": result.views.first().map(|views| &views.frames.own),
         "chi2_6_95": CHI2_6_95,
         "pairs": result.evaluation.pairs.iter().map(pair).collect::<Vec<_>>(),
@@ -146,15 +155,23 @@ fn alignments(result: &Outcome) -> Value {
         "checks": result.evaluation.checks.iter().map(|check| {
             json!({"what": check.what, "held": check.held, "found": check.found})
         }).collect::<Vec<_>>(),
-    })
+    });
+    // Swarms that know the metre are told nothing of scales.
+    if result.tracks.iter().any(|track| track.scale == ScaleKind::Unknown) {
+        document["conventions"] = json!(SCALED_CONVENTIONS);
+        document["chi2_7_95"] = json!(CHI2_7_95);
+        document["units_m"] = result.tracks.iter().map(|track| (track.name.clone(), json!(track.unit_m))).collect();
+    }
+    document
 }
 
 fn pair(pair: &Pair) -> Value {
     let [proposed, agreed, used] = pair.alignments;
     let is_similarity = matches!(pair.t_a_b, Some(Relative::Similarity(_)));
+    let has_scale = is_similarity || pair.error.is_some_and(|e| e.degrees_of_freedom == 7);
     let pose = |t: &Sim3| {
         let mut pose = json!({"translation": <[f64; 3]>::from(t.translation), "rotation": t.rotation.xyzw()});
-        if is_similarity {
+        if has_scale {
             pose["scale"] = json!(t.scale);
         }
         pose
@@ -166,6 +183,20 @@ fn pair(pair: &Pair) -> Value {
         };
         json!({"pose": pose(&t.sim()), "covariance": covariance, "sigmas": sigmas})
     };
+    let error = |e: &PoseError| {
+        let mut error = json!({
+            "xi": &e.xi.as_slice()[..e.degrees_of_freedom],
+            "translation_m": e.translation_m,
+            "rotation_deg": e.rotation_deg,
+            "nees": e.nees,
+            "inside_95": e.inside_95(),
+        });
+        if has_scale {
+            error["scale"] = json!(e.scale);
+            error["degrees_of_freedom"] = json!(e.degrees_of_freedom);
+        }
+        error
+    };
     json!({
         "a": pair.robots[0],
         "b": pair.robots[1],
@@ -174,13 +205,7 @@ fn pair(pair: &Pair) -> Value {
         "log10_nfa": pair.log10_nfa,
         "t_a_b": pair.t_a_b.as_ref().map(estimate),
         "truth": pair.truth.as_ref().map(pose),
-        "error": pair.error.map(|e| json!({
-            "xi": &e.xi.as_slice()[..e.degrees_of_freedom],
-            "translation_m": e.translation_m,
-            "rotation_deg": e.rotation_deg,
-            "nees": e.nees,
-            "inside_95": e.inside_95(),
-        })),
+        "error": pair.error.as_ref().map(error),
     })
 }
 

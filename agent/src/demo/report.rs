@@ -39,11 +39,9 @@ pub(super) fn evaluation(evaluation: &Evaluation, tracks: &[Track]) -> String {
     }
     let errors = evaluation.pairs.iter().filter_map(|pair| pair.error.as_ref());
     let (inside, all) = errors.fold((0, 0), |(inside, all), e| (inside + u32::from(e.inside_95()), all + 1));
-    let similarities = evaluation.pairs.iter().filter_map(|pair| pair.error).any(|e| e.degrees_of_freedom == 7);
-    let bound = if similarities { CHI2_7_95 } else { CHI2_6_95 };
     if all > 0 {
-        let _ =
-            writeln!(text, "  {inside} of {all} errors lie inside their claimed 95 % ellipsoid (NEES ≤ {bound:.3})");
+        let bound = bounds_95(evaluation);
+        let _ = writeln!(text, "  {inside} of {all} errors lie inside their claimed 95 % ellipsoid (NEES ≤ {bound})");
     }
     let Singles { count, nees_mean, inside_95, translation_rms_m, rotation_rms_deg } = evaluation.singles;
     if count > 0 {
@@ -57,6 +55,17 @@ pub(super) fn evaluation(evaluation: &Evaluation, tracks: &[Track]) -> String {
         trajectory(&mut text, errors, tracks);
     }
     text
+}
+
+/// The bounds of the ellipsoids, of as many kinds as there are.
+fn bounds_95(evaluation: &Evaluation) -> String {
+    let freedoms: BTreeSet<usize> =
+        evaluation.pairs.iter().filter_map(|pair| Some(pair.error?.degrees_of_freedom)).collect();
+    match (freedoms.contains(&6), freedoms.contains(&7)) {
+        (true, true) => format!("{CHI2_6_95:.3}, with a scale {CHI2_7_95:.3}"),
+        (false, true) => format!("{CHI2_7_95:.3}"),
+        _ => format!("{CHI2_6_95:.3}"),
+    }
 }
 
 fn alignment(text: &mut String, pair: &Pair) {
@@ -117,7 +126,10 @@ fn trajectory(text: &mut String, errors: &TrajectoryError, tracks: &[Track]) {
     };
     row("odometry alone, every true start given", &errors.alone_m);
     row("merged, only the first robot's true start given", &errors.merged_m);
-    row("merged, after the best rigid fit of the whole swarm", &errors.fitted_m);
+    match errors.fitted_scale {
+        None => row("merged, after the best rigid fit of the whole swarm", &errors.fitted_m),
+        Some(_) => row("merged, after the best fit of the swarm, with scale", &errors.fitted_m),
+    }
 }
 
 /// Bytes of payload each robot sent, by kind of message, and its memory (now, largest).

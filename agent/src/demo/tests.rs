@@ -14,6 +14,7 @@ use merganser_protocol::snapshot::{
 };
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::Stamp;
+use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::BTreeMap;
 
@@ -44,6 +45,7 @@ pub(super) fn tracks() -> Vec<Track> {
             name: (*name).into(),
             stamps_secs: (0..KEYFRAMES).map(|k| 0.5 * k as f64).collect(),
             odometry: drift.odometry(&truth, index as u64).unwrap().iter().map(|p| p.pose).collect(),
+            scale: ScaleKind::Metric,
             unit_m: Some(1.0),
             truth: Some(truth),
         }
@@ -344,8 +346,11 @@ fn views_are_read_from_json_and_bad_ones_are_not() {
 }
 
 /// Recordings of the tracks in `folder`, each keyframe seeing points of one room.
-fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
+pub(super) fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
     for track in tracks {
+        let unknown = track.scale == ScaleKind::Unknown;
+        let mut config = merganser_protocol::config::Config::default();
+        config.submap.scale = track.scale;
         let manifest = Manifest {
             format: String::new(),
             version: 0,
@@ -355,15 +360,16 @@ fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             clouds: CloudFormat::Ply,
             keyframes: 0,
             origin: "a test".into(),
-            unit_m: None,
-            config: merganser_protocol::config::Config::default(),
+            unit_m: track.unit_m.filter(|_| unknown),
+            config,
         };
         let mut writer = Writer::create(&folder.join(&track.name), manifest).unwrap();
         for (index, truth) in track.truth.as_ref().unwrap().iter().enumerate() {
             let room = (0..400)
                 .map(f64::from)
                 .map(|i| Vector3::new((i * 0.1) % 12.0 - 2.0, (i * 0.37).sin() * 4.0, (i % 10.0) * 0.2));
-            let points = room.map(|p| (truth.inverse() * p).map(|x| x as f32).into()).collect();
+            let unit_m = track.unit_m.unwrap_or(1.0);
+            let points = room.map(|p| (truth.inverse() * p).map(|x| (x / unit_m) as f32).into()).collect();
             let pose = PoseWithCovariance { pose: track.odometry[index], covariance: covariance() };
             let stamp = Stamp((track.stamps_secs[index] * 1e9) as i64);
             let covariance_of = CovarianceOf::Motion;

@@ -14,6 +14,8 @@ pub struct Track {
     pub stamps_secs: Vec<f64>,
     /// `t_frame_body` by odometry alone, one per keyframe, at least one.
     pub odometry: Vec<Se3>,
+    /// Whether the robot's SLAM knows the metre.
+    pub scale: ScaleKind,
     /// What one is in the odometry, m: 1 where the robot's SLAM knows the metre. `None` where nobody knows.
     pub unit_m: Option<f64>,
     /// `t_world_body`, m, one per keyframe.
@@ -25,7 +27,8 @@ impl Track {
     pub fn of(recording: &Recording) -> Self {
         let keyframes = recording.keyframes();
         let manifest = recording.manifest();
-        let unit_m = match manifest.config.submap.scale {
+        let scale = manifest.config.submap.scale;
+        let unit_m = match scale {
             ScaleKind::Metric => Some(1.0),
             ScaleKind::Unknown => manifest.unit_m,
         };
@@ -33,6 +36,7 @@ impl Track {
             name: manifest.robot.to_string(),
             stamps_secs: keyframes.iter().map(|line| line.stamp.as_secs_f64()).collect(),
             odometry: keyframes.iter().map(|line| line.pose.pose).collect(),
+            scale,
             unit_m,
             truth: recording.truth().map(|lines| lines.iter().map(|line| line.pose).collect()),
         }
@@ -56,4 +60,9 @@ impl Track {
         let t_world_body = Sim3::from_se3(self.truth.as_ref()?.get(keyframe)?);
         Some(t_world_body * unit * Sim3::from_se3(&self.odometry.get(keyframe)?.inverse()))
     }
+}
+
+/// The longest way by odometry, m. A drive of so many units that nobody knows is no length, and excuses no error.
+pub fn longest_m(tracks: &[Track]) -> f64 {
+    tracks.iter().filter(|track| track.unit_m.is_some()).map(Track::driven_m).fold(0.0, f64::max)
 }

@@ -3,6 +3,7 @@
 use super::track::Track;
 use super::views::{Views, pose, relative};
 use merganser_protocol::geometry::{Relative, Se3, Sim3, So3};
+use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::{Matrix3, Vector3};
 
 /// A keyframe belongs to a submap if its stamp lies in the submap's span, widened by this (stamps travel as floats), s.
@@ -53,21 +54,24 @@ pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Sim3> {
     Some(track.t_world_frame_at(at)? * Sim3::from_se3(&t_frame_anchor))
 }
 
-/// Root mean square errors of keyframe positions, m. Where units are unknown the first robot's true unit is given with its
-/// true start.
+/// Root mean square errors of keyframe positions, m.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectoryError {
     /// Odometry alone, given the true start of each robot; per robot and of all.
     pub alone_m: (Vec<f64>, f64),
-    /// Merged, given the true start of the first robot only.
+    /// Merged, given the true start of the first robot only, and its true unit where it does not know the metre.
     pub merged_m: (Vec<f64>, f64),
-    /// Merged, after the one rigid motion of the whole swarm that fits best.
+    /// Merged, after the one motion of the whole swarm that fits best.
     pub fitted_m: (Vec<f64>, f64),
+    /// The scale of that motion. The map's unit is the first robot's: where it knows the metre, the motion is rigid and
+    /// this is `None`, so that a wrong scale shows; where it does not, nothing in the map says how large it is.
+    pub fitted_scale: Option<f64>,
 }
 
 /// The paths' errors; `None` unless every robot merged and every truth is known.
 pub fn errors(tracks: &[Track], corrected: &[Option<Corrected>]) -> Option<TrajectoryError> {
-    let t_world_ref = tracks.first()?.t_world_frame()?;
+    let reference = tracks.first()?;
+    let t_world_ref = reference.t_world_frame()?;
     let (mut alone, mut merged, mut truths): (Vec<Vec<_>>, Vec<Vec<_>>, Vec<Vec<_>>) = Default::default();
     for (track, corrected) in tracks.iter().zip(corrected) {
         let t_world_frame = track.t_world_frame()?;
@@ -75,12 +79,17 @@ pub fn errors(tracks: &[Track], corrected: &[Option<Corrected>]) -> Option<Traje
         merged.push(corrected.as_ref()?.poses.iter().map(|pose| t_world_ref * pose.translation).collect());
         truths.push(track.truth.as_ref()?.iter().map(|pose| pose.translation).collect());
     }
-    let fit = fit(&merged.concat(), &truths.concat());
+    let (from, to) = (merged.concat(), truths.concat());
+    let fit = match reference.scale {
+        ScaleKind::Metric => Sim3::from_se3(&fit(&from, &to)),
+        ScaleKind::Unknown => fit_similarity(&from, &to),
+    };
     let fitted = merged.iter().map(|path| path.iter().map(|p| fit * *p).collect()).collect::<Vec<_>>();
     Some(TrajectoryError {
         alone_m: errors_of(&alone, &truths),
         merged_m: errors_of(&merged, &truths),
         fitted_m: errors_of(&fitted, &truths),
+        fitted_scale: (reference.scale == ScaleKind::Unknown).then_some(fit.scale),
     })
 }
 
@@ -94,9 +103,24 @@ fn rms(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> f64 {
     (sum / a.len().max(1) as f64).sqrt()
 }
 
+/// The similarity T with the least Σ |T aᵢ − bᵢ|² (Umeyama): the rotation is that of the rigid motion, and the scale the
+/// least squares one after it. Points that all lie in one place have no size; they are moved rigidly.
+pub fn fit_similarity(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> Sim3 {
+    let rotation = fit(a, b).rotation;
+    let (centre_a, centre_b) = (mean(a), mean(b));
+    let turned = a.iter().map(|a| rotation * (a - centre_a));
+    let along: f64 = turned.zip(b).map(|(a, b)| a.dot(&(b - centre_b))).sum();
+    let spread: f64 = a.iter().map(|a| (a - centre_a).norm_squared()).sum();
+    let scale = Some(along / spread).filter(|scale| scale.is_finite() && *scale > 0.0).unwrap_or(1.0);
+    Sim3::new(rotation, centre_b - rotation * centre_a * scale, scale)
+}
+
+fn mean(points: &[Vector3<f64>]) -> Vector3<f64> {
+    points.iter().sum::<Vector3<f64>>() / points.len().max(1) as f64
+}
+
 /// The rigid motion T with the least Σ |T aᵢ − bᵢ|² (Kabsch).
 pub fn fit(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> Se3 {
-    let mean = |points: &[Vector3<f64>]| points.iter().sum::<Vector3<f64>>() / points.len().max(1) as f64;
     let (centre_a, centre_b) = (mean(a), mean(b));
     let h: Matrix3<f64> = a.iter().zip(b).map(|(a, b)| (b - centre_b) * (a - centre_a).transpose()).sum();
     let svd = h.svd(true, true);

@@ -1,12 +1,15 @@
 //! The views of one robot as they are read off Zenoh, and poses out of them.
 
-use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
 use merganser_protocol::snapshot::{
     FramesView, GraphView, MapView, PairView, PoseView, RelationView, StatsView, StatusView,
 };
-use nalgebra::{SMatrix, Vector3};
+use nalgebra::SMatrix;
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
+
+/// What must be one may differ from it by this: numbers travel as text.
+const UNIT_SLACK: f64 = 1e-6;
 
 /// What one robot showed at one moment.
 #[derive(Clone, Debug, PartialEq)]
@@ -53,9 +56,10 @@ impl Views {
     }
 }
 
-/// A rigid pose.
+/// A pose without its scale; `None` if a number is not finite or the quaternion is not of length one.
 pub fn pose(view: &PoseView) -> Option<Se3> {
-    Some(Se3::new(So3::from_xyzw(view.rotation)?, Vector3::from(view.translation)))
+    let length = view.rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
+    Se3::from_xyzw(view.rotation, view.translation).filter(|_| (length - 1.0).abs() <= UNIT_SLACK)
 }
 
 /// A rigid pose with its covariance; `None` for a similarity.
@@ -66,17 +70,22 @@ pub fn relation(view: &RelationView) -> Option<PoseWithCovariance> {
     }
 }
 
-/// A relation with its covariance: a similarity where the covariance is one of seven values.
+/// A relation with its covariance: a similarity where the covariance is one of seven values. `None` if it is neither: a
+/// pose that is none, a scale that is none or, of a rigid one, not 1, or a covariance that is not positive definite.
 pub fn relative(view: &RelationView) -> Option<Relative> {
-    let pose = pose(&view.pose)?;
-    if view.covariance.len() == 21 {
-        let covariance = Covariance::new(square::<6>(&view.covariance)).ok()?;
-        return Some(Relative::Metric(PoseWithCovariance { pose, covariance }));
+    let (pose, scale) = (pose(&view.pose)?, view.pose.scale);
+    match view.covariance.len() {
+        21 if (scale - 1.0).abs() <= UNIT_SLACK => {
+            let covariance = Covariance::new(square::<6>(&view.covariance)).ok()?;
+            Some(Relative::Metric(PoseWithCovariance { pose, covariance }))
+        }
+        28 if scale.is_finite() && scale > 0.0 => {
+            let covariance = Covariance::new(square::<7>(&view.covariance)).ok()?;
+            let sim = Sim3::new(pose.rotation, pose.translation, scale);
+            Some(Relative::Similarity(SimWithCovariance { sim, covariance }))
+        }
+        _ => None,
     }
-    let scale = Some(view.pose.scale).filter(|scale| scale.is_finite() && *scale > 0.0)?;
-    let covariance = Covariance::new((view.covariance.len() == 28).then(|| square::<7>(&view.covariance))?).ok()?;
-    let sim = Sim3::new(pose.rotation, pose.translation, scale);
-    Some(Relative::Similarity(SimWithCovariance { sim, covariance }))
 }
 
 /// The symmetric matrix of a row-major upper triangle.

@@ -26,7 +26,7 @@ const ELLIPSE_PIXELS_MIN: f64 = 10.0;
 /// By which factors they may be.
 const ENLARGE: [f64; 6] = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
 
-/// One robot of the picture; positions in m.
+/// One robot of the picture; positions in m, or in units where nobody knows the metre ([`Scene::in_metres`]).
 #[derive(Clone, Debug, Default)]
 pub struct Robot {
     /// Its name.
@@ -227,7 +227,7 @@ fn ellipses(svg: &mut Svg, scene: &Scene, view: &View) {
     }
 }
 
-/// A bar of 1, 2 or 5 times a power of ten metres, about a sixth of the panel long.
+/// A bar of 1, 2 or 5 times a power of ten metres (or units), about a sixth of the panel long.
 fn scale_bar(svg: &mut Svg, view: &View, in_metres: bool) {
     let [x, y, w, h] = view.panel;
     let wanted = w / 6.0 / view.scale;
@@ -239,10 +239,11 @@ fn scale_bar(svg: &mut Svg, view: &View, in_metres: bool) {
     for end in [right - length, right] {
         svg.line(&[[end, bottom - 4.0], [end, bottom + 4.0]], INK, 2.0, "");
     }
-    let label = match metres < 1.0 {
-        _ if !in_metres => format!("{metres} units"),
-        true => format!("{:.0} cm", metres * 100.0),
-        false => format!("{metres:.0} m"),
+    let label = match in_metres {
+        true if metres < 1.0 => format!("{:.0} cm", metres * 100.0),
+        true => format!("{metres:.0} m"),
+        false if metres == 1.0 => "1 unit".into(),
+        false => format!("{metres} units"),
     };
     svg.text([right - length / 2.0, bottom - 9.0], 15.0, INK, Anchor::Middle, &label);
 }
@@ -344,6 +345,14 @@ mod tests {
         // Ink is the scale bars and the texts: without a font there would be next to none.
         assert!(near([0x1d, 0x27, 0x33]) > 300, "texts: {}", near([0x1d, 0x27, 0x33]));
         assert!(svg.contains("A test &amp; its &lt;picture&gt;"));
+    }
+
+    #[test]
+    fn lengths_are_metres_only_where_they_are() {
+        let known = draw(&scene());
+        let unknown = draw(&Scene { in_metres: false, ..scene() });
+        assert!(known.contains(">2 m<") && !known.contains("unit"), "a sixth of the panel is over two metres");
+        assert!(unknown.contains(">2 units<") && !unknown.contains(" m<"));
     }
 
     #[test]
