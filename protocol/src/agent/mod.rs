@@ -11,6 +11,7 @@ mod allowance;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
+mod distortion;
 mod gossip;
 pub mod io;
 pub mod job;
