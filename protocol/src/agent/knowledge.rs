@@ -1,7 +1,8 @@
 //! What the facts say, independent of the order they came in: the submaps, which alignments both endpoints agree on
 //! (the two-sided rule, DESIGN §3), and the estimation problem that follows from them.
 
-use super::{distortion, two_sided};
+use super::two_sided;
+use crate::estimate::distortion::{COMMON_BENT, COMMON_LIDAR};
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
 use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
@@ -257,7 +258,7 @@ impl Knowledge {
         let tie = |entry: EntryId, i: SubmapId, j: SubmapId, t_i_j: Relative| {
             Some(AgreedAlignment { entry, i: place(i)?, j: place(j)?, t_i_j })
         };
-        let (mut alignments, common): (Vec<AgreedAlignment>, Vec<f64>) = self
+        let agreed: Vec<(AgreedAlignment, f64)> = self
             .by_pair
             .iter()
             .filter(|((i, j), _)| place(*i).is_some() && place(*j).is_some())
@@ -265,10 +266,11 @@ impl Knowledge {
             .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
             .filter_map(|(entry, fact)| {
                 let tie = tie(entry, fact.i, fact.j, self.measurement(entry, fact))?;
-                Some((tie, distortion::common(bends(fact))))
+                Some((tie, if bends(fact) { COMMON_BENT } else { COMMON_LIDAR }))
             })
-            .unzip();
-        let shares = distortion::charge(&mut alignments, &common);
+            .collect();
+        let common = agreed.iter().map(|(tie, common)| (tie.entry, *common)).collect();
+        let alignments: Vec<AgreedAlignment> = agreed.into_iter().map(|(tie, _)| tie).collect();
         let sightings = self.sightings.iter();
         let sightings: Vec<AgreedAlignment> =
             sightings.filter_map(|(entry, fact)| tie(*entry, fact.i, fact.j, Relative::Metric(fact.t_i_j))).collect();
@@ -286,7 +288,7 @@ impl Knowledge {
         let gaps =
             posed.into_iter().filter(|(_, chain)| chain.last().is_some_and(|last| *last as usize >= chain.len()));
         Question {
-            problem: MapProblem { frames, alignments, sightings, shares, ambiguous: self.ambiguous() },
+            problem: MapProblem { frames, alignments, sightings, common, ambiguous: self.ambiguous() },
             alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
             gaps: gaps.collect(),
         }

@@ -11,7 +11,6 @@ mod allowance;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
-mod distortion;
 mod gossip;
 pub mod io;
 pub mod job;

@@ -21,10 +21,19 @@ const VARIANCE_MIN: f64 = 1e-12;
 pub enum Label {
     /// The owner's own motion estimate.
     Odometry,
+    /// Where a submap's cloud lies by its anchor, as all alignments see it.
+    Cloud,
     /// An agreed alignment.
     Alignment(EntryId),
     /// A direct measurement of another robot.
     Sighting(EntryId),
+}
+
+impl Label {
+    /// Whether the rest of the map may find it wrong.
+    pub(super) fn is_doubted(self) -> bool {
+        matches!(self, Self::Alignment(_) | Self::Sighting(_))
+    }
 }
 
 /// A relative measurement between two anchors.

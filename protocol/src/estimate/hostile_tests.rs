@@ -99,15 +99,15 @@ fn any_problem() -> impl Strategy<Value = MapProblem> {
     let lists = (prop::collection::vec(stated.clone(), 0..30), prop::collection::vec(stated, 0..5));
     let entry = (0..4u8, 0..30u32).prop_map(|(robot, seq)| EntryId { frame: frame(robot), seq });
     let share = prop_oneof![4 => 0.0..1.0, 1 => any::<f64>()];
-    let shares = prop::collection::btree_map(entry, share, 0..10);
+    let common = prop::collection::btree_map(entry, share, 0..10);
     let two = (0..4u8, 0..4u8).prop_map(|(a, b)| (frame(a.min(b)), frame(a.max(b))));
     let ambiguous = prop::collection::btree_map(two, prop_oneof![0..9usize, Just(usize::MAX)], 0..4);
-    (frames, lists, shares, ambiguous).prop_map(|(frames, (alignments, sightings), shares, ambiguous)| MapProblem {
+    (frames, lists, common, ambiguous).prop_map(|(frames, (alignments, sightings), common, ambiguous)| MapProblem {
         ambiguous,
         frames,
         alignments,
         sightings,
-        shares,
+        common,
     })
 }
 

@@ -3,10 +3,11 @@
 //! Facts come in any order and from anyone. Here they are sorted, repeats are set aside (one measurement counts once,
 //! DESIGN §8.10), and whatever names unknown submaps or holds invalid numbers is kept with its reason.
 
+use super::distortion;
 use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
 use super::trajectory::Trajectory;
-use crate::geometry::{Disagreement, PoseWithCovariance, Relative};
+use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
@@ -18,9 +19,6 @@ pub const SIGMA_ROTATION_MAX: f64 = 3.0;
 pub const SIGMA_TRANSLATION_MAX: f64 = 1e4;
 /// Log-scale standard deviation from which a measurement says nothing.
 pub const SIGMA_LOG_SCALE_MAX: f64 = 3.0;
-
-/// Least share of its information with which an alignment counts.
-pub const SHARE_MIN: f64 = 1e-6;
 
 /// What a measurement is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -63,9 +61,13 @@ impl Intake {
         let (mut entries, mut submaps) = (BTreeSet::new(), BTreeMap::new());
         for (kind, measurement) in alignments.chain(sightings) {
             let unused = intake.refusal(kind, &measurement, &mut entries, &mut submaps);
-            let share = share(problem, kind, measurement.entry);
-            let weight = if unused.is_none() { share } else { 0.0 };
-            intake.edges.push(EdgeEstimate { kind, measurement, weight, share, unused });
+            let stated = if kind == Kind::Alignment { problem.common.get(&measurement.entry) } else { None };
+            let common = distortion::bounded(stated.copied().unwrap_or(0.0));
+            intake.edges.push(EdgeEstimate { common, unused, ..EdgeEstimate::new(kind, measurement) });
+        }
+        distortion::charge(&mut intake.edges);
+        for edge in &mut intake.edges {
+            edge.weight = if edge.is_used() { edge.weight_at(1.0) } else { 0.0 };
         }
         intake
     }
@@ -117,7 +119,7 @@ impl Intake {
     /// Sets an edge aside; whether it counted until now.
     pub(super) fn drop_edge(&mut self, label: Label, reason: Unused) -> bool {
         let wanted = match label {
-            Label::Odometry => return false,
+            Label::Odometry | Label::Cloud => return false,
             Label::Alignment(entry) => (Kind::Alignment, entry),
             Label::Sighting(entry) => (Kind::Sighting, entry),
         };
@@ -216,12 +218,14 @@ impl EdgeEstimate {
         relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>,
     ) -> Option<Disagreement> {
         let predicted = relative(self.measurement.i, self.measurement.j)?;
-        Some(predicted.disagreement(&self.measurement.t_i_j.widened(sigma_scale / self.share.sqrt())))
+        Some(predicted.disagreement(&self.measurement.t_i_j.widened(sigma_scale * self.charges.in_all.sqrt())))
     }
 
-    /// Its weight where its pair found its standard deviations to need the factor `sigma_scale`.
+    /// Its weight where its pair found its standard deviations to need the factor `sigma_scale`. What it has in common
+    /// with others counts against a similarity here; else the graph knows of it ([`distortion::factors`]).
     pub(super) fn weight_at(&self, sigma_scale: f64) -> f64 {
-        self.share / (sigma_scale * sigma_scale)
+        let charge = if self.measurement.t_i_j.metric().is_some() { 1.0 } else { self.charges.in_all };
+        1.0 / (charge * sigma_scale * sigma_scale)
     }
 
     /// Takes the edge out of the estimate.
@@ -247,6 +251,14 @@ impl Chain {
         variances().fold(0.0, f64::max) / variances().fold(f64::MAX, f64::min)
     }
 
+    /// The odometry's walk while a submap was made: about that of the step to its anchor, or of the one from it; of the
+    /// two the smaller, as one may lead over a gap.
+    pub(super) fn walk(&self, index: usize) -> Option<&Covariance<6>> {
+        let [to, from] = [index.checked_sub(1), Some(index)].map(|k| Some(&self.steps.get(k?)?.covariance));
+        let volume = |covariance: &&Covariance<6>| covariance.matrix().determinant();
+        [to, from].into_iter().flatten().min_by(|a, b| volume(a).total_cmp(&volume(b)))
+    }
+
     /// Number of anchors.
     pub(super) fn len(&self) -> usize {
         self.trajectory.len()
@@ -265,12 +277,6 @@ impl Chain {
             weight: 1.0,
         })
     }
-}
-
-/// The share a problem gives a measurement, within bounds; one that is no number is taken as the whole.
-fn share(problem: &MapProblem, kind: Kind, entry: EntryId) -> f64 {
-    let stated = if kind == Kind::Alignment { problem.shares.get(&entry) } else { None };
-    stated.filter(|share| !share.is_nan()).map_or(1.0, |share| share.clamp(SHARE_MIN, 1.0))
 }
 
 fn says_nothing(t: &Relative) -> bool {

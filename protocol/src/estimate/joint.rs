@@ -4,10 +4,11 @@
 //! 1. `intake` sorts the facts canonically and lists what cannot be used.
 //! 2. `pairs` runs the frame-level consensus on each pair of frames and accepts merges along the strongest spanning
 //!    forest; a pair that contradicts a loop of frames (χ², 99.99 %) is left out.
-//! 3. Here, the whole graph is solved with the alignments that remain; one whose leave-one-out χ² exceeds 99.9 % is
+//! 3. Here, the whole graph is solved with the alignments that remain (`distortion` knows what they have in common); one whose leave-one-out χ² exceeds 99.9 % is
 //!    dropped, the largest first, and the graph solved again.
 //! 4. Sightings between merged frames, and alignments that no consensus weighed, join if they agree with that map.
 
+use super::distortion::{self, Charges};
 use super::graph::{Factor, Graph, Label};
 use super::intake::{Intake, Kind};
 use super::marginals::certain;
@@ -57,10 +58,10 @@ pub struct MapProblem {
     pub alignments: Vec<AgreedAlignment>,
     /// Direct measurements of other robots.
     pub sightings: Vec<AgreedAlignment>,
-    /// Alignments that count in the joint estimate with less than their whole information, because they have errors in
-    /// common with those of other pairs of frames: over 0 to 1, at least `SHARE_MIN` (1e-6); 1 for what is not
-    /// listed.
-    pub shares: BTreeMap<EntryId, f64>,
+    /// Alignments whose errors are not their own: which share of the variance each other alignment of the one submap has
+    /// in common with it, and as much of the other; 0 to 0.45 ([`COMMON_MAX`](super::distortion::COMMON_MAX)), 0 for what
+    /// is not listed.
+    pub common: BTreeMap<EntryId, f64>,
     /// Between two frames, `a < b`: pairs of submaps of which one end found an alignment, and the other end that there are
     /// several. Places that repeat themselves show by it.
     pub ambiguous: BTreeMap<(FrameId, FrameId), usize>,
@@ -131,8 +132,10 @@ pub struct EdgeEstimate {
     pub measurement: AgreedAlignment,
     /// What its information was multiplied by; 0 if unused.
     pub weight: f64,
-    /// What its information is multiplied by before anything is held against it.
-    pub(super) share: f64,
+    /// Share of its variance that it has in common with the others of either submap.
+    pub(super) common: f64,
+    /// What that costs where alignments are taken as independent.
+    pub(super) charges: Charges,
     /// Why it does not count; `None` if it does.
     pub unused: Option<Unused>,
 }
@@ -264,13 +267,16 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
     }
     let used = || intake.edges.iter().filter(|e| e.is_used());
     let solve_group = |members: BTreeSet<FrameId>| {
-        let nodes = members.iter().flat_map(|f| intake.chains[f].ids(*f)).collect();
+        let mut nodes: BTreeSet<SubmapId> = members.iter().flat_map(|f| intake.chains[f].ids(*f)).collect();
         let mut factors: Vec<Factor> = members.iter().flat_map(|f| intake.chains[f].factors(*f)).collect();
-        factors.extend(used().filter(|e| members.contains(&e.measurement.i.frame)).map(EdgeEstimate::factor));
+        let tied: Vec<&EdgeEstimate> = used().filter(|e| members.contains(&e.measurement.i.frame)).collect();
+        factors.extend(distortion::factors(&tied, |id| intake.chains.get(&id.frame)?.walk(id.index as usize)));
+        nodes.extend(factors.iter().filter(|factor| factor.label == Label::Cloud).map(|factor| factor.j));
         let solution = match Graph::components(&nodes, &intake.unknown_scale, factors) {
             Ok(mut graphs) if graphs.len() == 1 => {
                 let graph = graphs.remove(0);
-                let start = graph.nodes().iter().map(|id| start.get(id).copied().unwrap_or_else(Sim3::identity));
+                let place = |id: &SubmapId| start.get(id).or_else(|| start.get(&distortion::anchor_of(*id))).copied();
+                let start = graph.nodes().iter().map(|id| place(id).unwrap_or_else(Sim3::identity));
                 let start = start.collect();
                 solve(graph, start, iterations_max)
             }
@@ -283,13 +289,22 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
 }
 
 impl EdgeEstimate {
-    fn factor(&self) -> Factor {
+    pub(super) fn new(kind: Kind, measurement: AgreedAlignment) -> Self {
+        Self { kind, measurement, weight: 0.0, common: 0.0, charges: Charges::default(), unused: None }
+    }
+
+    pub(super) fn factor(&self) -> Factor {
         let AgreedAlignment { entry, i, j, t_i_j } = self.measurement;
         let label = match self.kind {
             Kind::Alignment => Label::Alignment(entry),
             Kind::Sighting => Label::Sighting(entry),
         };
         Factor { label, i, j, t_i_j, weight: self.weight }
+    }
+
+    /// `t_i_j`, one of several between its two frames that are taken as independent.
+    pub(super) fn among_others(&self) -> Relative {
+        self.measurement.t_i_j.widened(self.charges.between.sqrt())
     }
 
     /// Whether it counts in the joint estimate.
@@ -345,7 +360,7 @@ impl JointEstimate {
     pub fn values(&self, component: usize) -> BTreeMap<SubmapId, Se3> {
         let solution = self.components.get(component).and_then(|c| c.solution.as_ref());
         let places = solution.into_iter().flat_map(|s| s.graph().nodes().iter().copied().zip(s.values()));
-        places.map(|(id, value)| (id, value.to_se3())).collect()
+        places.filter(|(id, _)| !distortion::is_cloud(*id)).map(|(id, value)| (id, value.to_se3())).collect()
     }
 
     /// `t_i_j` between two anchors of one component, cross-correlations included: rigid between metric frames and
@@ -374,7 +389,8 @@ impl JointEstimate {
         };
         let origin = Relative::Metric(*origin);
         let place = |(id, t): (SubmapId, Relative)| (id, if id == first { origin } else { origin.compose(&t) });
-        solution.relatives_to(first, &self.unknown_scale).into_iter().map(place).collect()
+        let all = solution.relatives_to(first, &self.unknown_scale).into_iter();
+        all.filter(|(id, _)| !distortion::is_cloud(*id)).map(place).collect()
     }
 
     /// `t_a_b` between the frames' origins.

@@ -1,6 +1,5 @@
 //! The whole map: truth, calibration, order, false alignments, and hostile sets of facts.
 
-use super::intake::SHARE_MIN;
 use super::joint::*;
 use super::test_graphs::*;
 use super::test_world::*;
@@ -187,21 +186,24 @@ fn loop_closures_within_a_frame_are_used_and_false_ones_are_not() {
     assert!(last(&map) < 0.5 * last(&open));
 }
 
-/// A share is no word against an alignment: the consensus of its frames is as sure, and the map less.
+/// What alignments have in common is no word against any of them.
 #[test]
-fn a_share_widens_the_map_and_not_the_consensus_of_two_frames() {
+fn errors_in_common_widen_the_map_and_leave_the_weights_alone() {
     let rng = &mut rng(7);
     let mut world = World::new(rng, 2, 20, false);
     world.align(rng, frame(0), frame(1), 5, false);
+    let (i, j) = (world.problem.alignments[0].i, submap(1, 19));
+    let again = world.measure(Some(rng), i, j);
+    world.state(i, j, again);
     let whole = world.solve();
     let of = |m: &JointEstimate| rigid(&m.frame(frame(0), frame(1)).unwrap()).covariance.matrix().trace();
     let weights = |m: &JointEstimate| m.edges().iter().map(|e| e.weight).collect::<Vec<_>>();
-    for (stated, share) in [(0.25, 0.25), (1.0, 1.0), (-1.0, SHARE_MIN), (f64::NAN, 1.0), (7.0, 1.0)] {
-        world.problem.shares = world.problem.alignments.iter().map(|a| (a.entry, stated)).collect();
+    for (common, wider) in [(0.3, true), (0.0, false), (-1.0, false), (f64::NAN, false), (7.0, true)] {
+        world.problem.common = world.problem.alignments.iter().map(|a| (a.entry, common)).collect();
         let map = world.solve();
-        assert_eq!(map.pairs()[0].log10_nfa, whole.pairs()[0].log10_nfa, "{stated}");
-        assert_eq!(weights(&map), weights(&whole).iter().map(|w| w * share).collect::<Vec<_>>(), "{stated}");
-        assert!(if share < 1.0 { of(&map) > of(&whole) } else { of(&map) == of(&whole) }, "{stated}");
+        assert_eq!((weights(&map), map.nodes), (weights(&whole), whole.nodes), "{common}");
+        assert!(if wider { of(&map) > of(&whole) } else { of(&map) == of(&whole) }, "{common}");
+        assert_eq!(map.anchors(frame(0)).len(), 40, "{common}");
     }
 }
 

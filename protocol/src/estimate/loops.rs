@@ -30,7 +30,8 @@ pub(super) fn gate(intake: &mut Intake) {
         if e.kind != Kind::Alignment || e.unused.is_some() || m.i.frame != m.j.frame {
             continue;
         }
-        let Some(t) = m.t_i_j.metric() else { continue };
+        let among_others = e.among_others();
+        let Some(t) = among_others.metric() else { continue };
         let (i, j) = (m.i.index as usize, m.j.index as usize);
         let closure =
             if i < j { Closure { edge, i, j, t_i_j: *t } } else { Closure { edge, i: j, j: i, t_i_j: t.inverse() } };

@@ -2,6 +2,7 @@
 
 pub mod certificate;
 pub mod chordal;
+pub mod distortion;
 pub mod frames;
 pub mod graph;
 pub mod incremental;

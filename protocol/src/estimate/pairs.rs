@@ -294,12 +294,13 @@ impl Outcome {
     }
 }
 
-/// An alignment's anchors and measurement, turned so that `i` lies in the pair's first frame.
+/// An alignment's anchors and measurement, one of several between two frames, turned so that `i` lies in the first.
 fn orient(edge: &EdgeEstimate, a: FrameId) -> (usize, usize, Relative) {
     let m = &edge.measurement;
+    let t_i_j = edge.among_others();
     if m.i.frame == a {
-        (m.i.index as usize, m.j.index as usize, m.t_i_j)
+        (m.i.index as usize, m.j.index as usize, t_i_j)
     } else {
-        (m.j.index as usize, m.i.index as usize, m.t_i_j.inverse())
+        (m.j.index as usize, m.i.index as usize, t_i_j.inverse())
     }
 }

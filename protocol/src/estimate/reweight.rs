@@ -45,7 +45,7 @@ pub(super) struct Drop {
 /// that fail once `round` has reached the limit.
 pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
     let inverse = solution.selected_inverse();
-    let tested = solution.graph().edges().iter().filter(|e| e.factor.label != Label::Odometry);
+    let tested = solution.graph().edges().iter().filter(|e| e.factor.label.is_doubted());
     let failing = tested.filter_map(|edge| {
         let LeftOut { chi2, dof, .. } = leave_one_out(solution, &inverse, edge)?;
         let limit = CHI2_999.get(dof.checked_sub(1)?)?;

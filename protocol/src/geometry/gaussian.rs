@@ -4,7 +4,7 @@
 
 use super::sim3::Matrix7;
 use super::{Se3, Sim3, se3, sim3};
-use nalgebra::{Matrix6, SMatrix, SVector};
+use nalgebra::{DMatrix, Matrix6, SMatrix, SVector};
 use thiserror::Error;
 
 /// Largest asymmetry accepted, relative to the largest diagonal element.
@@ -100,6 +100,22 @@ impl<const N: usize> Covariance<N> {
     #[must_use]
     pub fn plus(&self, other: &Self) -> Self {
         Self::new_or_wider(self.0 + other.0)
+    }
+
+    /// Of the covariances that share the axes along which both are diagonal, the largest that neither is smaller than:
+    /// with `B = L Lᵀ` and `L⁻¹ A L⁻ᵀ = Q diag(w) Qᵀ`, `L Q diag(min(w, 1)) Qᵀ Lᵀ`. `None` where rounding leaves none.
+    pub fn meet(&self, other: &Self) -> Option<SMatrix<f64, N, N>> {
+        let l = other.0.cholesky()?.l();
+        let half = l.solve_lower_triangular(&self.0)?;
+        let whitened = l.solve_lower_triangular(&half.transpose())?;
+        let symmetric = (whitened + whitened.transpose()) * 0.5;
+        // Dynamic, because the eigen-solver wants a statically smaller type.
+        let eigen = DMatrix::from_iterator(N, N, symmetric.iter().copied()).symmetric_eigen();
+        let root = l * SMatrix::<f64, N, N>::from_iterator(eigen.eigenvectors.iter().copied());
+        let smaller = |i: usize| eigen.eigenvalues[i].clamp(0.0, 1.0);
+        let diagonal = SMatrix::<f64, N, N>::from_fn(|r, c| if r == c { smaller(r) } else { 0.0 });
+        let sum = root * diagonal * root.transpose();
+        Some((sum + sum.transpose()) * 0.5)
     }
 
     /// The covariance times `k` > 0, widened at the ends of the accepted range.
@@ -387,6 +403,25 @@ mod tests {
         let mut singular = with(0, 1, 1e-4);
         singular[(1, 0)] = 1e-4;
         assert_eq!(Covariance::new(singular), Err(CovarianceError::NotPositiveDefinite));
+    }
+
+    #[test]
+    fn what_two_have_in_common_is_in_both() {
+        let mut rng = rng(9);
+        let least = |m: SMatrix<f64, 6, 6>| m.symmetric_eigenvalues().min();
+        for _ in 0..50 {
+            let (a, b): (Covariance<6>, Covariance<6>) = (covariance(&mut rng), covariance(&mut rng));
+            let meet = a.meet(&b).unwrap();
+            let slack = 1e-10 * a.matrix().amax().max(b.matrix().amax());
+            assert!([a, b].iter().all(|one| least(one.matrix() - meet) > -slack));
+            assert!((b.meet(&a).unwrap() - meet).amax() < slack, "in either order");
+            // As large as can be: along each of the six axes it is the one or the other.
+            let beyond = |one: &Covariance<6>| {
+                (one.matrix() - meet).symmetric_eigenvalues().iter().filter(|&&w| w > slack).count()
+            };
+            assert_eq!(beyond(&a) + beyond(&b), 6);
+            assert!((a.scaled(0.5).meet(&a).unwrap() - a.matrix() * 0.5).amax() < slack);
+        }
     }
 
     #[test]

@@ -4,11 +4,7 @@
 //!
 //! A submap is anchored at its *middle* keyframe. Odometry that drifts bends the cloud, and what others align with is
 //! the cloud as a whole. For a random walk of variance w per submap the cloud's mean lies w/3 from the first body pose,
-//! in step with the odometry that follows; from the middle one only w/12, and against it. So a chain of middle anchors
-//! with the odometry's own covariance may be taken as a chain of the clouds themselves: the mean squared error is
-//! within some percent of the optimum and the stated covariance never smaller than it (for anchors at the first pose
-//! the stated one is up to a sixth too small, even with w/3 added to every alignment). Only the first anchor needs
-//! care: see [`FIRST_CLOUD_SHARE`].
+//! from the middle one only w/12; the joint estimate reckons with that (see [`distortion`](crate::estimate::distortion)).
 
 use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
 use super::odometry::{across_gap_after, isotropic, motion};
@@ -32,10 +28,6 @@ pub const STAMP_MAX: i64 = (1 << 62) - 1;
 /// Standard deviation (m and rad) of the first anchor in its frame: where the frame lies is a convention, so this is
 /// small, but not so small that it spoils the conditioning of an estimate.
 pub const FIRST_ANCHOR_SIGMA: f64 = 1e-4;
-
-/// Variance of the first submap's cloud about its frame's origin, per variance of the walk from the origin to the middle
-/// anchor: w/3 of w/2.
-pub const FIRST_CLOUD_SHARE: f64 = 2.0 / 3.0;
 
 /// A finished stretch of a robot's own trajectory.
 #[derive(Clone, Debug, PartialEq)]
@@ -365,7 +357,7 @@ impl Open {
     fn close(self, index: u32) -> Submap {
         let t_first_anchor = self.t_first_anchor();
         let t_anchor_first = t_first_anchor.inverse();
-        let odometry = self.odometry_to_anchor(index == 0);
+        let odometry = self.odometry_to_anchor();
         let anchor = self.middle();
         let keyframes: Vec<Se3> = self.keyframes.iter().map(|t_first_body| t_anchor_first * *t_first_body).collect();
         let constellation = settle(&self.landmarks.finish(), &self.motions, &keyframes, anchor);
@@ -385,15 +377,11 @@ impl Open {
         }
     }
 
-    fn odometry_to_anchor(&self, from_origin: bool) -> PoseWithCovariance {
+    fn odometry_to_anchor(&self) -> PoseWithCovariance {
         if self.middle() == 0 {
             return self.odometry;
         }
-        let mut to_anchor = along(self.motions.iter().take(self.middle()), self.t_first_anchor());
-        if from_origin {
-            to_anchor.covariance = to_anchor.covariance.scaled(FIRST_CLOUD_SHARE);
-        }
-        self.odometry.compose(&to_anchor)
+        self.odometry.compose(&along(self.motions.iter().take(self.middle()), self.t_first_anchor()))
     }
 }
 

@@ -1,6 +1,7 @@
 //! The shell's part of a robot: events become inputs, outputs become events.
 
 use super::robot::{Asked, job_nanos};
+use super::standin;
 use super::store::Committed;
 use super::{Event, OUTPUTS_MAX, Swarm, TOLD_MAX, Told, hostile};
 use crate::check::Seen;
@@ -9,6 +10,7 @@ use crate::network::{Tampering, millis};
 use crate::world::drive::Step;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, Output, QueryKind};
 use merganser_protocol::agent::job::{Job, JobResult};
+use merganser_protocol::geometry::Se3;
 use merganser_protocol::submap::Submap;
 use merganser_protocol::time::Instant;
 
@@ -146,21 +148,25 @@ impl<C: Core> Swarm<C> {
     /// Does heavy work, or what stands for it.
     fn work(&mut self, robot: usize, job: Job) -> JobResult {
         let drive = self.drives(robot);
-        let Some(standin) = &mut self.standin else {
+        let Some(stand_in) = &mut self.standin else {
             return self.stopwatch.time(job.kind(), || job.run());
         };
         let (one, steps) = (&self.robots[robot], self.stage.steps(drive));
-        // Among the submap's own keyframes: near their origins, two frames of one robot know the same poses.
         let locate = |submap: &Submap| {
+            // Among the submap's own keyframes: near their origins, two frames of one robot know the same poses.
             let [a, b] = submap.stamps.map(|stamp| one.slam.drive_nanos(stamp.as_secs_f64()));
             let span = a.min(b)..=a.max(b);
-            let anchor = submap.t_frame_anchor.translation;
-            let apart = |step: &&Step| (one.slam.t_frame_body(step).translation - anchor).norm();
-            let own = steps.iter().filter(|step| span.contains(&step.nanos));
-            Some(own.min_by(|a, b| apart(a).total_cmp(&apart(b)))?.t_world_body)
+            let own: Vec<&Step> = steps.iter().filter(|step| span.contains(&step.nanos)).collect();
+            let by_keyframe = |t_anchor_body: &Se3| {
+                let there = (submap.t_frame_anchor * *t_anchor_body).translation;
+                let apart = |step: &&&Step| (one.slam.t_frame_body(step).translation - there).norm();
+                let step = own.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))?;
+                Some(step.t_world_body * t_anchor_body.inverse())
+            };
+            standin::middle(&submap.keyframes.iter().filter_map(by_keyframe).collect::<Vec<_>>())
         };
         let kind = job.kind();
-        let (result, lied) = self.stopwatch.time(kind, || standin.run(one.name.as_str(), job, locate));
+        let (result, lied) = self.stopwatch.time(kind, || stand_in.run(one.name.as_str(), job, locate));
         self.counts.lies += u64::from(lied);
         result
     }

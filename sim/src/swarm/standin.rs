@@ -1,5 +1,5 @@
 //! At summary level, what takes the place of heavy work: submaps are described for real (they have few points), but an
-//! alignment is the truth with noise, if the two lie within reach, and the joint estimate may be left out.
+//! alignment is the truth about their clouds with noise, if they lie within reach, and the joint estimate may be left out.
 
 use crate::dice::Dice;
 use crate::scenario::SummaryOptions;
@@ -21,7 +21,7 @@ pub struct StandIn {
     places: BTreeMap<Hash, Place>,
 }
 
-/// Where a submap truly lies, and what all its alignments err by alike, in standard deviations of one.
+/// Where a submap's cloud truly lies, and what all its alignments err by alike, in standard deviations of one.
 #[derive(Clone, Copy, Debug)]
 struct Place {
     t_world_anchor: Se3,
@@ -34,8 +34,7 @@ impl StandIn {
         Self { options, seed, places: BTreeMap::new() }
     }
 
-    /// Does a job of the robot called `name`. `locate` says where the keyframe truly was that a submap's anchor names.
-    /// Returns whether it lied.
+    /// Does a job of the robot called `name`. `locate` says where a submap's cloud truly lies. Returns whether it lied.
     pub fn run(&mut self, name: &str, job: Job, locate: impl FnOnce(&Submap) -> Option<Se3>) -> (JobResult, bool) {
         match job {
             Job::Describe(job) => {
@@ -76,20 +75,20 @@ impl StandIn {
         let mut dice = Dice::new(self.seed, &format!("align {}", job.seed));
         let [t, r] = self.options.sigma;
         let sigmas = Vector6::from([t, t, t, r, r, r]);
-        let noise = sigmas.map(|sigma| sigma * dice.normal());
-        let (mut pose, covariance) = match self.options.common {
-            0.0 => (truth.retract(&noise), Covariance::from_sigmas(sigmas.into())),
-            common => {
-                let bent = |place: &Place| Se3::exp(&(place.bent.component_mul(&sigmas) * common.sqrt()));
-                let own = noise * (1.0 - 2.0 * common).sqrt();
-                let pose = bent(mine).inverse() * truth * bent(theirs) * Se3::exp(&own);
-                let variance = Matrix6::from_diagonal(&sigmas.component_mul(&sigmas));
-                // What bends mine moves theirs by the lever between them.
-                let lever = truth.inverse().adjoint();
-                let sum = lever * variance * lever.transpose() * common + variance * (1.0 - common);
-                (pose, Covariance::new(sum))
-            }
-        };
+        let variance = Matrix6::from_diagonal(&sigmas.component_mul(&sigmas));
+        let common = self.options.common;
+        // What two clouds have in common lies between them: noise that is the same from either side. What bends a cloud
+        // turns about its anchor, and moves the other by the lever between them.
+        let t_theirs_between = truth.inverse().interpolate(&Se3::identity(), 0.5);
+        let noise =
+            t_theirs_between.adjoint() * sigmas.map(|sigma| sigma * dice.normal() * (1.0 - 2.0 * common).sqrt());
+        let bent = |place: &Place| Se3::exp(&(place.bent.component_mul(&sigmas) * common.sqrt()));
+        let mut pose = bent(mine).inverse() * truth * bent(theirs) * Se3::exp(&noise);
+        let seen_from = |lever: &Matrix6<f64>, share: f64| lever * variance * lever.transpose() * share;
+        let covariance = seen_from(&t_theirs_between.adjoint(), 1.0 - 2.0 * common)
+            + seen_from(&truth.inverse().adjoint(), common)
+            + variance * common;
+        let covariance = Covariance::new(covariance);
         if lies {
             let mut dice = Dice::new(self.seed, &format!("lie {name}"));
             let falsehood = Vector6::from([4.0, 4.0, 0.0, 0.0, 0.0, 1.5].map(|size| size * dice.range(0.5, 1.0)));
@@ -99,6 +98,14 @@ impl StandIn {
         let t_mine_theirs = Relative::Metric(PoseWithCovariance { pose, covariance });
         Ok(Measured { t_mine_theirs, sigma: t, support: 40.0, log10_nfa: -20.0 })
     }
+}
+
+/// Where a cloud lies whose keyframes, each alone, would put its anchor there: odometry that drifts bends it, so that it is
+/// not where its anchor was. `None` without a keyframe.
+pub fn middle(t_world_anchor: &[Se3]) -> Option<Se3> {
+    let about = t_world_anchor.first()?;
+    let sum: Vector6<f64> = t_world_anchor.iter().map(|t| about.local(t)).sum();
+    Some(about.retract(&(sum / t_world_anchor.len() as f64)))
 }
 
 #[cfg(test)]
@@ -158,6 +165,15 @@ mod tests {
             let [mine, theirs] = [0.0, 2.0].map(|x| described(&mut standin, points, x));
             assert_eq!(align(&mut standin, &mine, &theirs, 1).is_ok(), aligned, "{points} points");
         }
+    }
+
+    #[test]
+    fn a_cloud_lies_amid_its_keyframes() {
+        let there = Se3::exp(&Vector6::from([1.0, 2.0, 3.0, 0.3, -0.2, 0.5]));
+        let off = |k: f64| there.retract(&(Vector6::from([0.03, -0.01, 0.02, 0.004, 0.002, -0.005]) * k));
+        let found = middle(&[off(-1.0), off(3.0), off(1.0), off(-3.0)]).unwrap();
+        assert!(there.local(&found).norm() < 1e-6 && middle(&[]).is_none());
+        assert_eq!(middle(&[there]), Some(there));
     }
 
     /// Alignments of one submap err alike, by the stated share, and as much as they say.
