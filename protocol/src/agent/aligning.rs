@@ -6,6 +6,7 @@ use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Look, Measured};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
 use super::negotiation::{FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work};
+use super::promise::Guess;
 use super::ranking::Proposal;
 use super::shortlist::Candidate;
 use crate::config::AlignConfig;
@@ -133,7 +134,7 @@ impl Agent {
 
     fn start_proposing(&mut self, active: &[Proposal]) {
         self.negotiation.begun.retain(|begun| active.iter().any(|p| pair_of(p.mine, p.theirs) == *begun));
-        for &Proposal { mine, theirs, may_wait, bytes } in active {
+        for &Proposal { mine, theirs, may_wait, bytes, guess } in active {
             if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
                 break;
             }
@@ -149,7 +150,7 @@ impl Agent {
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
             let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);
             let lacks = ours.any(|id| self.negotiation.features(id).is_none());
-            if lacks || self.start_alignment(mine, theirs, Purpose::Propose) {
+            if lacks || self.start_alignment(mine, theirs, Purpose::Propose(guess)) {
                 self.negotiation.mark_tried(pair);
             }
         }
@@ -289,7 +290,8 @@ impl Agent {
         self.negotiation.stir();
         self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
         match work.purpose {
-            Purpose::Propose => {
+            Purpose::Propose(guess) => {
+                self.tell_try(&work, guess, outcome.is_ok());
                 if let Ok(measured) = outcome {
                     self.propose(&work, &measured);
                 }
@@ -306,6 +308,12 @@ impl Agent {
                 self.write_verdict(id, verdict);
             }
         }
+    }
+
+    fn tell_try(&mut self, work: &Work, guess: Guess, found: bool) {
+        self.negotiation.promise.learn(&guess.signs, found);
+        let (i, j) = pair_of(work.mine, work.theirs);
+        self.event(Event::AlignmentTried { i, j, expected: guess.probability, found });
     }
 
     fn propose(&mut self, work: &Work, measured: &Measured) {

@@ -235,6 +235,17 @@ pub enum Event {
         /// Keypoints offered.
         keypoints: usize,
     },
+    /// We tried to align two submaps that, as far as one could tell, might overlap.
+    AlignmentTried {
+        /// Target.
+        i: SubmapId,
+        /// Source.
+        j: SubmapId,
+        /// How probable success seemed.
+        expected: f64,
+        /// Whether there was any.
+        found: bool,
+    },
     /// We computed an alignment and stated it.
     AlignmentProposed {
         /// Target.

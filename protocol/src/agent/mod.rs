@@ -20,6 +20,7 @@ mod knowledge;
 mod ledger;
 mod mapping;
 mod negotiation;
+mod promise;
 mod ranking;
 mod shortlist;
 mod sighting;
@@ -161,6 +162,7 @@ impl Agent {
         let frame = FrameId { robot, epoch: restored.fresh_epoch };
         let mut agent = Self {
             mapper: Mapper::new(&config.submap),
+            negotiation: Negotiation::new(config.submap.sensor),
             allowance: Allowance::new(config.align.further_bytes_per_sec, now.min(LATEST)),
             gossip: Gossip::new(robot, &config.gossip, now.min(LATEST)),
             me: Me { robot, frame, key, name: identity.name, swarm: identity.swarm },
@@ -172,7 +174,6 @@ impl Agent {
             outputs: VecDeque::new(),
             ledger: Ledger::default(),
             knowledge: Knowledge::default(),
-            negotiation: Negotiation::default(),
             map: MapState::default(),
             stats: Stats::default(),
             condensing: Condensing::default(),

@@ -9,7 +9,9 @@
 
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
+use super::promise::{Guess, Promise};
 use super::shortlist::{Candidate, Shortlist};
+use crate::config::Sensor;
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::{Features, Keypoints};
 use crate::time::Instant;
@@ -51,10 +53,10 @@ pub const FETCH_ATTEMPTS_MAX: u32 = 6;
 pub const FETCH_BACKOFF_MAX: Duration = Duration::from_secs(30);
 
 /// What a running alignment is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Purpose {
-    /// To state it.
-    Propose,
+    /// To state it, if there is any.
+    Propose(Guess),
     /// To answer somebody's alignment.
     Verify(EntryId),
 }
@@ -93,13 +95,15 @@ impl Fetch {
 }
 
 /// Everything the negotiation remembers.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Negotiation {
     features: BTreeMap<SubmapId, Arc<Features>>,
     keypoints: BTreeMap<Hash, Arc<Keypoints>>,
     candidates: Shortlist,
     tried: BTreeSet<Pair>,
     tries: BTreeMap<(SubmapId, FrameId), usize>,
+    /// What candidates promise.
+    pub promise: Promise,
     /// Foreign alignments to answer.
     pub verify: BTreeSet<EntryId>,
     /// Blobs on their way.
@@ -117,6 +121,25 @@ pub struct Negotiation {
 }
 
 impl Negotiation {
+    /// Nothing is known yet of what this sensor sees.
+    pub fn new(sensor: Sensor) -> Self {
+        Self {
+            features: BTreeMap::new(),
+            keypoints: BTreeMap::new(),
+            candidates: Shortlist::default(),
+            tried: BTreeSet::new(),
+            tries: BTreeMap::new(),
+            promise: Promise::new(sensor),
+            verify: BTreeSet::new(),
+            fetches: BTreeMap::new(),
+            out_of_reach: BTreeSet::new(),
+            running: BTreeMap::new(),
+            begun: BTreeSet::new(),
+            stirred: false,
+            wishes: Shortlist::default(),
+        }
+    }
+
     /// Which of the two robots begins with this pair. Both compute the same answer.
     pub fn responsible(pair: Pair) -> RobotId {
         let mut bytes = Vec::with_capacity(32);
@@ -294,7 +317,7 @@ mod tests {
 
     #[test]
     fn the_candidate_list_keeps_the_most_similar_up_to_its_limit() {
-        let mut n = Negotiation::default();
+        let mut n = Negotiation::new(Sensor::Points3d);
         for k in 0..10 {
             n.add_candidate(candidate(k, f64::from(k)), 5);
         }
@@ -304,7 +327,7 @@ mod tests {
 
     #[test]
     fn a_tried_pair_never_returns_and_tries_are_bounded_per_frame() {
-        let mut n = Negotiation::default();
+        let mut n = Negotiation::new(Sensor::Points3d);
         for k in 0..2 * TRIES_PER_SUBMAP as u32 {
             n.add_candidate(candidate(k, 1.0), 1000);
         }
@@ -321,7 +344,7 @@ mod tests {
     fn fetches_that_wait_for_a_link_stop_no_others_up_to_a_limit() {
         let later = Instant::ZERO.after(Duration::from_secs(5));
         for (not_before, limit) in [(later, FETCHES_WAITING_MAX), (Instant::ZERO, 2 * FETCHES_MAX)] {
-            let mut n = Negotiation::default();
+            let mut n = Negotiation::new(Sensor::Points3d);
             for k in 0..limit {
                 assert!(!n.is_fetching_enough(Instant::ZERO), "{k} of {limit}");
                 let fetch = Fetch { not_before, ..Fetch::new(RobotId([2; 8]), Instant::ZERO) };
@@ -333,7 +356,7 @@ mod tests {
 
     #[test]
     fn a_failing_fetch_backs_off_and_is_given_up_at_the_bound() {
-        let mut n = Negotiation::default();
+        let mut n = Negotiation::new(Sensor::Points3d);
         let (hash, query) = (Hash::of(b"x"), QueryId(7));
         n.fetches.insert(hash, Fetch::new(RobotId([2; 8]), Instant::ZERO));
         let mut last = Duration::ZERO;

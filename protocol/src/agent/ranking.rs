@@ -5,6 +5,7 @@ use super::Agent;
 use super::allowance::FACT_BYTES;
 use super::knowledge::{Agreement, Pair, pair_of};
 use super::negotiation::{ALIGNMENTS_PER_SUBMAP, LOOPS_PER_SUBMAP, TRIES_PER_SUBMAP_FREE, TRIES_PER_SUBMAP_TIED};
+use super::promise::{Guess, Signs};
 use super::shortlist::Candidate;
 use super::stated::Stated;
 use crate::geometry::Relative;
@@ -15,11 +16,16 @@ use crate::ids::SubmapId;
 const NEWS_MIN: f64 = 1.0;
 /// The same where no keypoints have to be sent and many alignments of one submap say more than one.
 const NEWS_MIN_FREE: f64 = 0.25;
+/// Two submaps that the joint estimate connects are tried from this probability of success on. Those of frames that
+/// nothing connects yet always are: a robot that met nobody for long has learned to expect nothing.
+const PROMISE_MIN: f64 = 0.2;
+/// What the other endpoint asked for counts by so much more.
+const WISHED: f64 = 1.5;
 /// Alignments, in units of what it takes to merge, after which two frames that still have not merged may wait with more.
 const MERGE_ATTEMPTS: usize = 2;
 
 /// A pair worth trying.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Proposal {
     pub mine: SubmapId,
     pub theirs: SubmapId,
@@ -27,6 +33,8 @@ pub(super) struct Proposal {
     pub may_wait: bool,
     /// About what it makes both ends send.
     pub bytes: usize,
+    /// How probable it is that it can be aligned.
+    pub guess: Guess,
 }
 
 impl Agent {
@@ -41,7 +49,8 @@ impl Agent {
             // Theirs is about as long as ours.
             let blob = self.knowledge.submap(mine).and_then(|known| self.gossip.blob(known.blob));
             let bytes = lacking * blob.map_or(0, <[u8]>::len) + 2 * FACT_BYTES;
-            Proposal { mine, theirs, may_wait: !joins && lacking > 0, bytes }
+            let guess = self.guess(&candidate);
+            Proposal { mine, theirs, may_wait: !joins && lacking > 0, bytes, guess }
         };
         self.negotiation.ranked(|candidate| self.gain(candidate, &stated)).into_iter().map(proposal).collect()
     }
@@ -85,11 +94,14 @@ impl Agent {
         }
         let lacking = self.blobs_lacking(candidate, stated);
         let is_tied = stated.is_tied(pair);
-        let worth = candidate.similarity + if candidate.wished { 0.5 } else { 0.0 };
+        let Guess { probability, signs } = self.guess(candidate);
+        let worth = probability * if candidate.wished { WISHED } else { 1.0 };
         let Some((at_a, at_b)) = self.anchor(pair.0).zip(self.anchor(pair.1)) else {
-            return (!is_tied).then_some(1.5 + worth);
+            return (!is_tied).then_some(1.5 + worth / (1 + lacking) as f64);
         };
-        let near = self.nearness(pair, at_a, at_b)?;
+        if signs.apart? > 1.0 || probability < PROMISE_MIN {
+            return None;
+        }
         let news = stated.sigma(pair).map(|sigma| drift_between(at_a, at_b) / (sigma * at_b.sim().scale));
         let (tries, least) = match lacking == 0 && averages {
             true => (TRIES_PER_SUBMAP_FREE, NEWS_MIN_FREE),
@@ -100,16 +112,21 @@ impl Agent {
         }
         // Loops of our own come first: they take no keypoints.
         let share = news.filter(|_| !is_loop).map_or(1.0, |news| news / (1.0 + news));
-        Some(0.5 * worth * near * share / (1 + lacking) as f64)
+        Some(0.5 * worth * share / (1 + lacking) as f64)
     }
 
-    /// How far the two submaps reach into one another, as far as one can tell from where they are: 1 where they are at one
-    /// place, nothing where they do not touch.
-    fn nearness(&self, (a, b): Pair, at_a: &Relative, at_b: &Relative) -> Option<f64> {
-        let (at_a, at_b) = (at_a.sim(), at_b.sim());
+    fn guess(&self, candidate: &Candidate) -> Guess {
+        let apart = self.apart(pair_of(candidate.mine, candidate.theirs));
+        self.negotiation.promise.guess(Signs { similarity: candidate.similarity, apart })
+    }
+
+    /// How far two submaps are from one another by the joint estimate: 0 where they are at one place, 1 where, as far as one
+    /// can tell from their extents, they just touch.
+    fn apart(&self, (a, b): Pair) -> Option<f64> {
+        let (at_a, at_b) = (self.anchor(a)?.sim(), self.anchor(b)?.sim());
         let apart = (at_a.translation - at_b.translation).norm();
         let reach = at_a.scale * self.reach(a) + at_b.scale * self.reach(b);
-        (apart <= reach).then(|| if reach > 0.0 { 1.0 - apart / reach } else { 1.0 })
+        Some(if apart == 0.0 { 0.0 } else { apart / reach })
     }
 
     /// How far from its anchor a submap may still overlap another, in its frame's unit: half its extent.

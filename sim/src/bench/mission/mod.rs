@@ -75,6 +75,7 @@ pub fn run(options: &Mission) -> anyhow::Result<bool> {
     let accurate = accuracy(&outcome, snapshot, &anchors, &mut out)?;
     let frugal = traffic(&outcome, &mut out)?;
     work(&outcome, &mut out)?;
+    expectations(&outcome, &mut out)?;
     Ok(merged && accurate && frugal)
 }
 
@@ -201,6 +202,32 @@ fn work(outcome: &Outcome<Agent>, out: &mut impl Write) -> anyhow::Result<()> {
         share("align"),
         share("describe"),
         share("solve")
+    )?;
+    Ok(())
+}
+
+/// Whether tries came out as probable as they had seemed.
+fn expectations(outcome: &Outcome<Agent>, out: &mut impl Write) -> anyhow::Result<()> {
+    let tries = outcome.told.iter().filter_map(|(_, _, event)| match event {
+        Event::AlignmentTried { expected, found, .. } => Some((*expected, f64::from(u8::from(*found)))),
+        _ => None,
+    });
+    let tries: Vec<(f64, f64)> = tries.collect();
+    let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len() as f64;
+    let fifths = (0..5).map(|fifth| {
+        let is_in = |expected: f64| ((expected * 5.0) as usize).min(4) == fifth;
+        let found: Vec<f64> = tries.iter().filter(|one| is_in(one.0)).map(|one| one.1).collect();
+        let share = if found.is_empty() { "–".to_owned() } else { format!("{:.0} %", 100.0 * mean(&found)) };
+        format!("to {} %: {share} of {}", 20 * (fifth + 1), found.len())
+    });
+    let error = mean(&tries.iter().map(|(expected, found)| (expected - found).powi(2)).collect::<Vec<_>>());
+    let rate = mean(&tries.iter().map(|one| one.1).collect::<Vec<_>>());
+    writeln!(
+        out,
+        "of tries that seemed good for so much came to something: {}; mean squared error {error:.3}, of who knows no more \
+         than the rate {:.3}",
+        fifths.collect::<Vec<_>>().join(", "),
+        rate * (1.0 - rate)
     )?;
     Ok(())
 }

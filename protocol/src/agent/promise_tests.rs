@@ -1,0 +1,92 @@
+use super::*;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+
+const SENSORS: [Sensor; 5] =
+    [Sensor::Points3d, Sensor::Lidar3d, Sensor::Laser2d, Sensor::Landmarks, Sensor::Landmarks2d];
+
+fn signs(similarity: f64, apart: Option<f64>) -> Signs {
+    Signs { similarity, apart }
+}
+
+#[test]
+fn the_more_alike_and_the_nearer_the_more_probable() {
+    for sensor in SENSORS {
+        let promise = Promise::new(sensor);
+        let of = |similarity, apart| promise.guess(signs(similarity, apart)).probability;
+        let usual = Usual::of(sensor).similarity;
+        assert!(of(usual + 0.1, None) > of(usual, None) && of(usual, None) > of(usual - 0.1, None), "{sensor:?}");
+        assert!(of(usual, Some(0.1)) > of(usual, Some(0.5)) && of(usual, Some(0.5)) > of(usual, Some(0.9)));
+        assert!(of(usual, Some(0.0)) > of(usual, None));
+    }
+}
+
+/// Evenly from 0 to 1.
+fn unit(rng: &mut ChaCha8Rng) -> f64 {
+    (rng.next_u64() >> 11) as f64 / (1u64 << 53) as f64
+}
+
+/// A place where similarity tells more than is usual, in which two thirds of all tries are in vain.
+fn place(rng: &mut ChaCha8Rng) -> (Signs, bool) {
+    let similarity = 0.8 + 0.16 * unit(rng);
+    let apart = (unit(rng) < 0.5).then(|| unit(rng));
+    let odds = -2.0 + 30.0 * (similarity - 0.88) + apart.map_or(0.0, |apart| 4.0 - 9.0 * apart);
+    (signs(similarity, apart), unit(rng) < logistic(odds))
+}
+
+/// Mean squared error of a probability, and by how much what was expected of each fifth of all tries is off, at most.
+fn judged(of: &mut [(f64, bool)]) -> (f64, f64) {
+    of.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let came = |&(_, aligned): &(f64, bool)| f64::from(u8::from(aligned));
+    let error = of.iter().map(|one| (one.0 - came(one)).powi(2)).sum::<f64>() / of.len() as f64;
+    let off = |part: &[(f64, bool)]| part.iter().map(|one| one.0 - came(one)).sum::<f64>() / part.len() as f64;
+    (error, of.chunks(of.len() / 5).map(off).fold(0.0, |most: f64, off| most.max(off.abs())))
+}
+
+#[test]
+fn what_is_expected_comes_about_in_a_place_that_is_not_as_usual() {
+    let (mut learned, mut usual) = (Vec::new(), Vec::new());
+    for seed in 0..20 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (mut promise, prior) = (Promise::new(Sensor::Lidar3d), Promise::new(Sensor::Lidar3d));
+        for _ in 0..300 {
+            let (signs, aligned) = place(&mut rng);
+            learned.push((promise.guess(signs).probability, aligned));
+            usual.push((prior.guess(signs).probability, aligned));
+            promise.learn(&signs, aligned);
+        }
+    }
+    let (error, off) = judged(&mut learned);
+    assert!(off < 0.05 && error < 0.15, "off by {off:.3}, error {error:.3}");
+    // The judge bites: without learning it is off.
+    let (error, off) = judged(&mut usual);
+    assert!(off > 0.1 && error > 0.16, "off by {off:.3}, error {error:.3}");
+}
+
+#[test]
+fn nothing_that_comes_about_breaks_it() {
+    for sensor in SENSORS {
+        for (aligned, alternating) in [(true, false), (false, false), (true, true)] {
+            let mut promise = Promise::new(sensor);
+            for k in 0..20_000u32 {
+                let far = [signs(0.0, None), signs(1.0, Some(0.0)), signs(0.0, Some(1.0)), signs(1.0, None)];
+                let one = far[k as usize % far.len()];
+                promise.learn(&one, aligned ^ (alternating && k % 3 == 0));
+                let Guess { probability, .. } = promise.guess(one);
+                assert!((0.0..=1.0).contains(&probability), "{sensor:?} after {k}: {probability}");
+            }
+            assert!(promise.covariance.cholesky().is_some(), "{sensor:?}: {promise:?}");
+        }
+    }
+}
+
+/// A robot that has met nobody for long takes few tries to expect something again.
+#[test]
+fn what_was_learned_is_not_for_ever() {
+    let mut promise = Promise::new(Sensor::Lidar3d);
+    let one = signs(0.9, None);
+    (0..2_000).for_each(|_| promise.learn(&one, false));
+    assert!(promise.guess(one).probability < 0.02);
+    (0..8).for_each(|_| promise.learn(&one, true));
+    assert!(promise.guess(one).probability > 0.2, "{}", promise.guess(one).probability);
+}
