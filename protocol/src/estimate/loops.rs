@@ -2,17 +2,20 @@
 //!
 //! A closure must agree with the odometry between its ends (χ², 99.9 %), and pairs of closures with each other through
 //! the odometry that joins their ends (pairwise consistency, Mangelson et al. 2018, with odometry segments taken as
-//! independent). Of closures that contradict each other, the one with the most contradictions goes first.
+//! independent; of many, each with a fixed number of others, so that the cost grows with their number). Of closures that contradict each other, the one with the most contradictions goes first.
 
 use super::intake::{Chain, Intake, Kind};
 use super::joint::Unused;
 use super::reweight::CHI2_999;
-use crate::geometry::PoseWithCovariance;
+use super::ways::{Way, Ways, compose, inverse};
+use crate::geometry::{Covariance, PoseWithCovariance};
 use crate::ids::FrameId;
 use std::collections::BTreeMap;
 
 /// Closures of one frame compared with one another; beyond, only odometry and the joint estimate test them.
 const CLOSURES_COMPARED_MAX: usize = 256;
+/// Others that one of them is compared with at most: a false one contradicts most of these as it does most of all.
+const COMPARISONS_MAX: usize = 32;
 
 /// One closure with `i < j`.
 struct Closure {
@@ -56,13 +59,15 @@ pub(super) fn gate(intake: &mut Intake) {
     }
 }
 
-/// Edges of the closures to be left out so that the rest agree pairwise.
+/// Edges of the closures to be left out so that the rest agree with those that they are compared with.
 fn outvoted(chain: &Chain, closures: &[Closure]) -> Vec<usize> {
     let n = closures.len().min(CLOSURES_COMPARED_MAX);
     let mut conflicts = vec![Vec::new(); n];
-    for l in 0..n {
-        for m in 0..l {
-            if !consistent(chain, &closures[l], &closures[m]) {
+    let ways = Ways::new(&chain.trajectory, closures[..n].iter().flat_map(|c| [c.i, c.j]));
+    for (l, closure) in closures[..n].iter().enumerate() {
+        let around = Around::of(closure, &ways);
+        for m in compared(n, l) {
+            if !around.agrees_with(&closures[m], &ways) {
                 conflicts[l].push(m);
                 conflicts[m].push(l);
             }
@@ -80,8 +85,56 @@ fn outvoted(chain: &Chain, closures: &[Closure]) -> Vec<usize> {
     out
 }
 
-fn consistent(chain: &Chain, l: &Closure, m: &Closure) -> bool {
-    let (out, back) = (chain.trajectory.relative(l.i, m.i), chain.trajectory.relative(m.j, l.j));
-    let through_m = out.zip(back).map(|(out, back)| out.compose(&m.t_i_j).compose(&back));
-    through_m.is_some_and(|t| t.distance_squared(&l.t_i_j) <= CHI2_999[5])
+/// The others of n closures in a ring that the `l`-th begins a comparison with: all that are nearer to it one way round
+/// than the other, or as many of them as there may be, evenly.
+fn compared(n: usize, l: usize) -> impl Iterator<Item = usize> {
+    let half = n.saturating_sub(1) / 2;
+    let kept = half.min(COMPARISONS_MAX / 2);
+    let steps = (0..kept).map(move |k| (k + 1) * half / kept);
+    let opposite = (n.is_multiple_of(2) && l < n / 2 && n <= COMPARISONS_MAX).then_some(n / 2);
+    steps.chain(opposite).map(move |step| (l + step) % n)
+}
+
+/// A closure, and the odometry from its ends to where others stand.
+struct Around<'a> {
+    closure: &'a Closure,
+    from_i: Vec<Way>,
+    from_j: Vec<Way>,
+}
+
+impl<'a> Around<'a> {
+    fn of(closure: &'a Closure, ways: &Ways) -> Self {
+        let from = |anchor| ways.from(ways.slot(anchor));
+        Self { closure, from_i: from(closure.i), from_j: from(closure.j) }
+    }
+
+    fn agrees_with(&self, other: &Closure, ways: &Ways) -> bool {
+        let there = self.from_i.get(ways.slot(other.i)).zip(self.from_j.get(ways.slot(other.j)));
+        there.is_some_and(|(out, back)| {
+            let along = (other.t_i_j.pose, *other.t_i_j.covariance.matrix());
+            let (pose, sigma) = compose(&compose(out, &along), &inverse(back));
+            let through_other = PoseWithCovariance { pose, covariance: Covariance::new_or_wider(sigma) };
+            through_other.distance_squared(&self.closure.t_i_j) <= CHI2_999[5]
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn few_are_all_compared_once_and_each_of_many_with_as_many_others() {
+        for n in 0..=300 {
+            let pairs: Vec<(usize, usize)> =
+                (0..n).flat_map(|l| compared(n, l).map(move |m| (l.min(m), l.max(m)))).collect();
+            let distinct: BTreeSet<(usize, usize)> = pairs.iter().copied().collect();
+            assert!(distinct.len() == pairs.len() && pairs.iter().all(|(l, m)| l != m && *m < n), "{n}");
+            let of = |k: usize| pairs.iter().filter(|(l, m)| *l == k || *m == k).count();
+            let each = (0..n).map(of).collect::<BTreeSet<_>>();
+            let expected = if n <= COMPARISONS_MAX + 1 { n.saturating_sub(1) } else { COMPARISONS_MAX };
+            assert!(each.iter().all(|&count| count == expected), "{n}: {each:?}");
+        }
+    }
 }

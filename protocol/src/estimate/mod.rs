@@ -19,6 +19,7 @@ mod reweight;
 pub mod solve;
 mod sparse;
 pub mod trajectory;
+mod ways;
 
 pub use intake::Kind as EdgeKind;
 pub use joint::{

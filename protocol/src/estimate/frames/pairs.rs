@@ -8,11 +8,10 @@ use super::clique::{self, Set, bit};
 use super::measured::{Alignment, Measured};
 use super::scaled::{Scale, Scaled};
 use crate::estimate::residual::Residual;
-use crate::estimate::trajectory::Trajectory;
-use crate::geometry::Se3;
+use crate::estimate::ways::{Way, Ways};
 use core::f64::consts::PI;
 use libm::{lgamma, log};
-use nalgebra::{Matrix6, SMatrix};
+use nalgebra::SMatrix;
 
 /// Distances between n alignments, row = hypothesis, column = the alignment tested under it.
 pub(super) struct Pairs {
@@ -36,13 +35,13 @@ impl Pairs {
             scales: vec![Scale { value: 1.0, log_sigma: f64::INFINITY }; n * n],
         };
         let (alpha, beta) = (
-            Odometry::new(measured.alpha, alignments.iter().map(|a| a.i)),
-            Odometry::new(measured.beta, alignments.iter().map(|a| a.j)),
+            Ways::new(measured.alpha, alignments.iter().map(|a| a.i)),
+            Ways::new(measured.beta, alignments.iter().map(|a| a.j)),
         );
         for (m, hypothesis) in alignments.iter().enumerate() {
-            let (from_i, from_j) = (alpha.relatives(m), beta.relatives(m));
+            let (from_i, from_j) = (alpha.from(alpha.slot(hypothesis.i)), beta.from(beta.slot(hypothesis.j)));
             for (l, tested) in alignments.iter().enumerate().filter(|&(l, _)| l != m) {
-                let (a, b) = (&from_i[alpha.slot[l]], &from_j[beta.slot[l]]);
+                let (a, b) = (&from_i[alpha.slot(tested.i)], &from_j[beta.slot(tested.j)]);
                 let scale = Scale::of_pair(hypothesis, tested, a, b);
                 let (d2, log_sqrt_det) = distance(hypothesis, tested, a, b, scale.value);
                 pairs.scales[m * n + l] = scale;
@@ -106,8 +105,8 @@ impl Pairs {
 fn distance<const N: usize, G: Scaled<N>>(
     hypothesis: &Alignment<N, G>,
     tested: &Alignment<N, G>,
-    (a, sigma_a): &(Se3, Matrix6<f64>),
-    (b, sigma_b): &(Se3, Matrix6<f64>),
+    (a, sigma_a): &Way,
+    (b, sigma_b): &Way,
     scale: f64,
 ) -> (f64, f64) {
     let ((tested, of_tested), (hypothesis, of_hypothesis)) = (tested.at(scale), hypothesis.at(scale));
@@ -125,46 +124,4 @@ fn distance<const N: usize, G: Scaled<N>>(
 fn log_ball_volume(dimension: usize) -> f64 {
     let half = 0.5 * dimension as f64;
     half * log(PI) - lgamma(half + 1.0)
-}
-
-/// Odometry between the distinct anchors that alignments stand on.
-struct Odometry {
-    /// Position of each alignment's anchor among the distinct ones.
-    slot: Vec<usize>,
-    /// From each distinct anchor to the next.
-    steps: Vec<(Se3, Matrix6<f64>)>,
-}
-
-impl Odometry {
-    fn new(trajectory: &Trajectory, anchors: impl Iterator<Item = usize> + Clone) -> Self {
-        let mut distinct: Vec<usize> = anchors.clone().collect();
-        distinct.sort_unstable();
-        distinct.dedup();
-        let slot = anchors.map(|a| distinct.partition_point(|&d| d < a)).collect();
-        let steps = distinct.windows(2).filter_map(|w| trajectory.relative_exact(w[0], w[1])).collect();
-        Self { slot, steps }
-    }
-
-    /// Every distinct anchor relative to that of alignment `m`.
-    fn relatives(&self, m: usize) -> Vec<(Se3, Matrix6<f64>)> {
-        let own = self.slot[m];
-        let mut relatives = vec![(Se3::identity(), Matrix6::zeros()); self.steps.len() + 1];
-        for k in own..self.steps.len() {
-            relatives[k + 1] = compose(&relatives[k], &self.steps[k]);
-        }
-        for k in (0..own).rev() {
-            relatives[k] = compose(&relatives[k + 1], &inverse(&self.steps[k]));
-        }
-        relatives
-    }
-}
-
-fn compose((a, sigma_a): &(Se3, Matrix6<f64>), (b, sigma_b): &(Se3, Matrix6<f64>)) -> (Se3, Matrix6<f64>) {
-    let m = b.inverse().adjoint();
-    (*a * *b, m * sigma_a * m.transpose() + sigma_b)
-}
-
-fn inverse((a, sigma): &(Se3, Matrix6<f64>)) -> (Se3, Matrix6<f64>) {
-    let m = a.adjoint();
-    (a.inverse(), m * sigma * m.transpose())
 }
