@@ -19,6 +19,8 @@ const NEWS_MIN_FREE: f64 = 0.25;
 /// Two submaps that the joint estimate connects are tried from this probability of success on. Those of frames that
 /// nothing connects yet always are: a robot that met nobody for long has learned to expect nothing.
 const PROMISE_MIN: f64 = 0.2;
+/// A submap may have drifted from another by so many standard deviations.
+const DRIFT_SIGMAS: f64 = 2.0;
 /// What the other endpoint asked for counts by so much more.
 const WISHED: f64 = 1.5;
 /// Alignments, in units of what it takes to merge, after which two frames that still have not merged may wait with more.
@@ -99,7 +101,7 @@ impl Agent {
         let Some((at_a, at_b)) = self.anchor(pair.0).zip(self.anchor(pair.1)) else {
             return (!is_tied).then_some(1.5 + worth / (1 + lacking) as f64);
         };
-        if signs.apart? > 1.0 || probability < PROMISE_MIN {
+        if signs.apart.is_some_and(|apart| apart > 1.0) || probability < PROMISE_MIN {
             return None;
         }
         let news = stated.sigma(pair).map(|sigma| drift_between(at_a, at_b) / (sigma * at_b.sim().scale));
@@ -120,13 +122,9 @@ impl Agent {
         self.negotiation.promise.guess(Signs { similarity: candidate.similarity, apart })
     }
 
-    /// How far two submaps are from one another by the joint estimate: 0 where they are at one place, 1 where, as far as one
-    /// can tell from their extents, they just touch.
+    /// How far two submaps are from one another by the joint estimate; see [`apart`].
     fn apart(&self, (a, b): Pair) -> Option<f64> {
-        let (at_a, at_b) = (self.anchor(a)?.sim(), self.anchor(b)?.sim());
-        let apart = (at_a.translation - at_b.translation).norm();
-        let reach = at_a.scale * self.reach(a) + at_b.scale * self.reach(b);
-        Some(if apart == 0.0 { 0.0 } else { apart / reach })
+        apart((self.anchor(a)?, self.reach(a)), (self.anchor(b)?, self.reach(b)))
     }
 
     /// How far from its anchor a submap may still overlap another, in its frame's unit: half its extent.
@@ -152,6 +150,17 @@ impl Agent {
     }
 }
 
+/// How far two anchors are from one another, at the least that is likely: 0 where they may be at one place, 1 where, as far
+/// as one can tell from their reaches, the submaps just touch. `None` where nothing is known of that, for one has drifted
+/// from the other by more than both reach: such a pair must not be passed over, nor count as near.
+fn apart((at_a, reach_a): (&Relative, f64), (at_b, reach_b): (&Relative, f64)) -> Option<f64> {
+    let apart = (at_a.sim().translation - at_b.sim().translation).norm();
+    let reach = at_a.sim().scale * reach_a + at_b.sim().scale * reach_b;
+    let drift = DRIFT_SIGMAS * drift_between(at_a, at_b);
+    let least = (apart - drift).max(0.0);
+    (drift <= reach).then_some(if least == 0.0 { 0.0 } else { least / reach })
+}
+
 /// The least that the standard deviation of two anchors' distance vector can be, over all axes, in the unit of the frame that
 /// both are given in: the difference of those of their positions (triangle inequality in L²), whatever they share.
 fn drift_between(a: &Relative, b: &Relative) -> f64 {
@@ -172,6 +181,22 @@ mod tests {
     fn metric(sigma: f64) -> Relative {
         let covariance = Covariance::from_sigmas([sigma; 6]).unwrap();
         Relative::Metric(PoseWithCovariance { pose: pose(), covariance })
+    }
+
+    /// A loop is looked for where the odometry may be wrong, not only where it says that one is.
+    #[test]
+    fn what_has_drifted_is_nearer_than_it_seems_or_anywhere() {
+        let at = |x: f64, sigma: f64| {
+            let covariance = Covariance::from_sigmas([sigma, sigma, sigma, 0.01, 0.01, 0.01]).unwrap();
+            let pose = Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0));
+            Relative::Metric(PoseWithCovariance { pose, covariance })
+        };
+        let of = |x: f64, drift: f64| apart((&at(0.0, 0.1), 3.0), (&at(x, 0.1 + drift / 3.0f64.sqrt()), 2.0));
+        let is = |found: Option<f64>, expected: f64| found.is_some_and(|found| (found - expected).abs() < 1e-9);
+        assert!(is(of(4.0, 0.0), 0.8) && is(of(10.0, 0.0), 2.0) && is(of(0.0, 0.0), 0.0));
+        assert!(is(of(4.0, 0.5), 0.6) && is(of(10.0, 2.4), 1.04) && is(of(4.0, 2.4), 0.0));
+        // Twice 2.6 m is more than the 5 m that both reach.
+        assert_eq!((of(10.0, 2.6), of(0.0, 2.6), of(1000.0, 300.0)), (None, None, None));
     }
 
     /// A frame whose unit is half of ours: what it takes for a metre is half of one.
