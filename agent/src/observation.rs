@@ -15,12 +15,22 @@
 //! ```text
 //! "points": [[1.5, 0.2, 0.0]], "landmarks": [{"covariance": [1e-3, 0, 0, 1e-3, 0, 1e-3], "label": 72}]
 //! ```
+//!
+//! `place` is what your own place recognition (NetVLAD and the like) says of the keyframe: a vector of 2 to 16,384 numbers,
+//! how two are compared (`"cosine"` or `"euclidean"`), and a name for what made it, for only vectors of one model are
+//! compared. Submaps that have one are proposed for alignment by it. A message may do without (in postcard: end with its
+//! landmarks).
+//!
+//! ```text
+//! "place": {"model": "netvlad-pitts30k", "metric": "cosine", "vector": [0.017, -0.004, 0.021]}
+//! ```
 
 use merganser_protocol::agent::io::Sighting;
 use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::Name;
 use merganser_protocol::submap::landmarks::Descriptor;
-use merganser_protocol::submap::{CovarianceOf, Keyframe, Mark};
+use merganser_protocol::submap::place::Metric;
+use merganser_protocol::submap::{CovarianceOf, Keyframe, Mark, PlaceDescriptor, PlaceError};
 use merganser_protocol::time::Stamp;
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use serde::de::DeserializeOwned;
@@ -52,6 +62,22 @@ pub struct KeyframeMessage {
     /// What else is known of each point, if these are landmarks; else none.
     #[serde(default)]
     pub landmarks: Vec<LandmarkMessage>,
+    /// What the user's own place recognition says, if there is one.
+    #[serde(default)]
+    pub place: Option<PlaceMessage>,
+}
+
+/// A place descriptor of the user's own.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlaceMessage {
+    /// What made it; only vectors of one model are compared.
+    #[serde(default)]
+    pub model: String,
+    /// How two are compared.
+    pub metric: Metric,
+    /// The numbers.
+    pub vector: Vec<f32>,
 }
 
 /// What is known of a landmark besides its place.
@@ -130,6 +156,9 @@ pub enum ObservationError {
         /// What is wrong with it.
         error: CovarianceError,
     },
+    /// The place descriptor is none.
+    #[error("{0}")]
+    Place(#[from] PlaceError),
     /// Too many points.
     #[error("{0} points; send at most {POINTS_MAX}, thinned if need be")]
     Points(usize),
@@ -141,17 +170,22 @@ pub enum ObservationError {
 /// [`ObservationError`].
 pub fn keyframe(format: Format, bytes: &[u8]) -> Result<Keyframe, ObservationError> {
     let message = decode::<KeyframeMessage>(format, bytes).or_else(|error| match error {
-        ObservationError::Postcard(_) => without_landmarks(bytes).ok_or(error),
+        ObservationError::Postcard(_) => of_earlier_days(bytes).ok_or(error),
         _ => Err(error),
     });
     Keyframe::try_from(message?)
 }
 
-/// A postcard message that ends with its points.
-fn without_landmarks(bytes: &[u8]) -> Option<KeyframeMessage> {
-    let complete = [bytes, &[0]].concat();
-    let (message, rest) = postcard::take_from_bytes::<KeyframeMessage>(&complete).ok()?;
-    (rest.is_empty() && message.landmarks.is_empty()).then_some(message)
+/// A postcard message that ends with its landmarks or with its points: what follows was not known yet.
+fn of_earlier_days(bytes: &[u8]) -> Option<KeyframeMessage> {
+    let completed = |missing: usize| {
+        let complete = [bytes, &[0, 0][..missing]].concat();
+        let (message, rest) = postcard::take_from_bytes::<KeyframeMessage>(&complete).ok()?;
+        // What was added stands for what is not there, and for nothing else.
+        let is_so = rest.is_empty() && message.place.is_none() && (missing == 1 || message.landmarks.is_empty());
+        is_so.then_some(message)
+    };
+    completed(1).or_else(|| completed(2))
 }
 
 /// Decodes and checks a sighting.
@@ -191,8 +225,10 @@ impl TryFrom<KeyframeMessage> for Keyframe {
             mark(landmark).map_err(|error| ObservationError::LandmarkCovariance { index, error })
         };
         let marks = message.landmarks.iter().enumerate().map(mark).collect::<Result<_, _>>()?;
+        let named = |place: PlaceMessage| PlaceDescriptor::new(&place.model, place.metric, place.vector);
+        let place = message.place.map(named).transpose()?;
         let stamp = Stamp(message.stamp_ns);
-        Ok(Self { stamp, pose, covariance_of: message.covariance_of, points: message.points, marks })
+        Ok(Self { stamp, pose, covariance_of: message.covariance_of, points: message.points, marks, place })
     }
 }
 
@@ -211,6 +247,12 @@ impl From<&Mark> for LandmarkMessage {
     }
 }
 
+impl From<&PlaceDescriptor> for PlaceMessage {
+    fn from(place: &PlaceDescriptor) -> Self {
+        Self { model: place.model().into(), metric: place.metric(), vector: place.vector().to_vec() }
+    }
+}
+
 impl From<&Keyframe> for KeyframeMessage {
     fn from(keyframe: &Keyframe) -> Self {
         let covariance = keyframe.pose.covariance.matrix();
@@ -222,6 +264,7 @@ impl From<&Keyframe> for KeyframeMessage {
             covariance_of: keyframe.covariance_of,
             points: keyframe.points.clone(),
             landmarks: keyframe.marks.iter().map(Into::into).collect(),
+            place: keyframe.place.as_ref().map(Into::into),
         }
     }
 }
@@ -293,7 +336,13 @@ mod tests {
             covariance_of: CovarianceOf::Pose,
             points: vec![[1.0, 2.0, 3.0], [-1.0, 0.5, 0.25]],
             landmarks: vec![],
+            place: None,
         }
+    }
+
+    fn of_a_place() -> KeyframeMessage {
+        let place = PlaceMessage { model: "net".into(), metric: Metric::Euclidean, vector: vec![0.25, -3.0, 1.5] };
+        KeyframeMessage { place: Some(place), ..message() }
     }
 
     fn of_landmarks() -> KeyframeMessage {
@@ -311,17 +360,47 @@ mod tests {
         assert_eq!(a, b);
         assert_eq!((a.marks[0].label, a.marks[1].descriptor), (Some(72), Some([7; 32])));
         assert_eq!(KeyframeMessage::from(&a).landmarks, of_landmarks().landmarks);
-        // What was sent before there were landmarks ends with its points.
-        let plain = postcard::to_stdvec(&message()).unwrap();
-        let (earlier, none) = plain.split_at(plain.len() - 1);
-        assert_eq!(none, [0]);
-        assert_eq!(keyframe(Format::Postcard, earlier).unwrap(), keyframe(Format::Postcard, &plain).unwrap());
-        for len in 0..earlier.len() {
-            assert!(keyframe(Format::Postcard, &earlier[..len]).is_err(), "cut to {len}");
+    }
+
+    #[test]
+    fn a_place_travels_and_is_checked() {
+        let json = serde_json::to_vec(&of_a_place()).unwrap();
+        let postcard = postcard::to_stdvec(&of_a_place()).unwrap();
+        let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+        assert_eq!(a, b);
+        assert_eq!(
+            KeyframeMessage::from(&a),
+            KeyframeMessage { rotation: a.pose.pose.rotation.xyzw(), ..of_a_place() }
+        );
+        let mut zero = of_a_place();
+        zero.place.as_mut().unwrap().vector = vec![0.0; 3];
+        assert_eq!(Keyframe::try_from(zero), Err(ObservationError::Place(PlaceError::Zero)));
+        let written = br#"{"metric": "cosine", "vector": [1, 2]}"#;
+        assert_eq!(serde_json::from_slice::<PlaceMessage>(written).unwrap().model, "");
+    }
+
+    #[test]
+    fn what_was_sent_before_there_were_places_or_landmarks_is_understood() {
+        let whole = |message: &KeyframeMessage| postcard::to_stdvec(message).unwrap();
+        let of = |bytes: &[u8]| keyframe(Format::Postcard, bytes);
+        let (plain, marked, placed) = (whole(&message()), whole(&of_landmarks()), whole(&of_a_place()));
+        assert!(plain.ends_with(&[0, 0]) && marked.ends_with(&[0]));
+        for missing in [1, 2] {
+            assert_eq!(of(&plain[..plain.len() - missing]), of(&plain));
+        }
+        assert_eq!(of(&marked[..marked.len() - 1]), of(&marked));
+        // Anything shorter was cut.
+        for (bytes, known) in [(&plain, plain.len() - 2), (&marked, marked.len() - 1), (&placed, placed.len())] {
+            // Up to the end of its points or of no landmarks, it is a plain one.
+            let is_plain =
+                |len: usize| (plain.len() - 2..plain.len()).contains(&len) && plain.starts_with(&bytes[..len]);
+            for len in (0..known).filter(|&len| !is_plain(len)) {
+                assert!(of(&bytes[..len]).is_err(), "cut to {len} of {}", bytes.len());
+            }
         }
         for extra in [&[0][..], &[0, 0], &[1]] {
             let longer = [&plain[..], extra].concat();
-            assert_eq!(keyframe(Format::Postcard, &longer), Err(ObservationError::Trailing(extra.len())));
+            assert_eq!(of(&longer), Err(ObservationError::Trailing(extra.len())));
         }
     }
 
@@ -381,16 +460,6 @@ mod tests {
     #[test]
     fn decoding_takes_the_whole_input_and_known_fields_alone() {
         let good = postcard::to_stdvec(&message()).unwrap();
-        // The last byte says that there are no landmarks; a message without it is one that does not know them.
-        let last = good.len() - 1;
-        for end in 0..last {
-            assert!(keyframe(Format::Postcard, &good[..end]).is_err(), "{end}");
-        }
-        assert_eq!(keyframe(Format::Postcard, &good[..last]), keyframe(Format::Postcard, &good));
-        let landmarks = postcard::to_stdvec(&of_landmarks()).unwrap();
-        for end in last + 1..landmarks.len() {
-            assert!(keyframe(Format::Postcard, &landmarks[..end]).is_err(), "{end}");
-        }
         let long = [good, vec![0, 0]].concat();
         assert_eq!(keyframe(Format::Postcard, &long), Err(ObservationError::Trailing(2)));
         let mut json = serde_json::to_value(message()).unwrap();

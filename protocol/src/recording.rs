@@ -7,6 +7,8 @@
 //!   `stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,…,c55,cloud` (21 numbers of the covariance's upper triangle, tangent order
 //!   (ρ, φ), local perturbation).
 //! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, m, one per keyframe.
+//! - `places.f32` (if the manifest has `[places]`): what the user's own place recognition says of each keyframe, a row of
+//!   little-endian f32 each, as `numpy.ndarray.tofile` writes them; a row of NaN where there is nothing to say.
 //! - the clouds that the keyframes name, relative to the folder, points in the body frame.
 //!
 //! A data set for several robots is a folder whose sub-folders are recordings.
@@ -52,9 +54,25 @@ pub struct Manifest {
     /// is judged by it; no agent is told. In [`UNIT_RANGE_M`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit_m: Option<f64>,
+    /// What the rows of `places.f32` are, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub places: Option<PlaceFormat>,
     /// Overrides of the agent's core configuration that suit this sensor (e.g. `submap.voxel_m`).
     #[serde(default)]
     pub config: crate::config::Config,
+}
+
+/// What `places.f32` holds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlaceFormat {
+    /// What made the vectors; only those of one model are compared.
+    #[serde(default)]
+    pub model: String,
+    /// How they are compared.
+    pub metric: crate::submap::place::Metric,
+    /// Numbers of each.
+    pub numbers: usize,
 }
 
 /// How a cloud file is stored.

@@ -9,7 +9,7 @@ use core::fmt::Write as _;
 use merganser_protocol::geometry::{Covariance, Se3};
 use merganser_protocol::ids::{Name, NameError};
 use merganser_protocol::recording::{
-    CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION, XYZ_I16_UNIT_M,
+    CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, PlaceFormat, TRUTH_HEADER, VERSION, XYZ_I16_UNIT_M,
 };
 use merganser_protocol::submap::landmarks::DESCRIPTOR_LEN;
 use merganser_protocol::submap::{CovarianceOf, Mark};
@@ -105,6 +105,7 @@ fn record_robot(
         done.bytes += bytes.len() as u64;
         write_file(path, bytes)
     };
+    let (mut places, mut format) = (Vec::new(), None);
     let steps = stage.steps(robot);
     for (index, step) in steps.iter().enumerate() {
         let (points, marks) = stage.scan(robot, index).map_err(StageError::Drift)?;
@@ -114,6 +115,11 @@ fn record_robot(
         };
         put(folder.join(&cloud), &bytes)?;
         done.points += points.len();
+        if let Some(place) = stage.place(robot, index) {
+            places.extend(place.vector().iter().flat_map(|x| x.to_le_bytes()));
+            let (model, metric) = (place.model().to_owned(), place.metric());
+            format = Some(PlaceFormat { model, metric, numbers: place.vector().len() });
+        }
         let stamp = FIRST_STAMP_NS.saturating_add_unsigned(step.nanos);
         let odometry = numbers(&pose(&step.t_frame_body), false);
         let covariance = numbers(&triangle(&step.motion.covariance), true);
@@ -123,7 +129,11 @@ fn record_robot(
     }
     put(folder.join("keyframes.csv"), keyframes.as_bytes())?;
     put(folder.join("truth.csv"), truth.as_bytes())?;
-    put(folder.join("recording.toml"), manifest(scenario, origin, name, steps.len(), stage.unit_m(robot))?.as_bytes())?;
+    if format.is_some() {
+        put(folder.join("places.f32"), &places)?;
+    }
+    let manifest = Manifest { places: format, ..manifest(scenario, origin, name, steps.len(), stage.unit_m(robot))? };
+    put(folder.join("recording.toml"), toml::to_string(&manifest)?.as_bytes())?;
     done.keyframes = steps.len();
     done.metres = scenario.drive.keyframe_m * steps.len().saturating_sub(1) as f64;
     done.secs = steps.last().map_or(0.0, |step| step.nanos as f64 * 1e-9);
@@ -136,10 +146,10 @@ fn manifest(
     name: &str,
     keyframes: usize,
     unit_m: f64,
-) -> Result<String, RecordError> {
+) -> Result<Manifest, RecordError> {
     let config = scenario.config_of(name);
     let unit_is_unknown = config.submap.scale == ScaleKind::Unknown;
-    let manifest = Manifest {
+    Ok(Manifest {
         format: FORMAT.to_owned(),
         version: VERSION,
         robot: Name::new(name)?,
@@ -149,9 +159,9 @@ fn manifest(
         keyframes,
         origin: origin.to_owned(),
         unit_m: unit_is_unknown.then_some(unit_m),
+        places: None,
         config,
-    };
-    Ok(toml::to_string(&manifest)?)
+    })
 }
 
 /// `[x, y, z, qx, qy, qz, qw]`.

@@ -7,6 +7,7 @@ use crate::network::NetworkOptions;
 use crate::world::WorldOptions;
 use crate::world::drive::DriveOptions;
 use crate::world::landmarks::LandmarkOptions;
+use crate::world::places::PlaceOptions;
 use crate::world::sensor::SensorOptions;
 use merganser_protocol::config::{Config, ConfigError, Sensor};
 use merganser_protocol::wire::fact::ScaleKind;
@@ -57,6 +58,9 @@ pub struct Scenario {
     /// Who is in reach of whom: all, unless told otherwise. Once faults are over, nobody is out of reach of all others.
     #[serde(default)]
     pub radio: Layout,
+    /// What a place-recognition network of theirs says of each keyframe; without it, none runs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub places: Option<PlaceOptions>,
     /// Their computers.
     #[serde(default)]
     pub machine: MachineOptions,
@@ -212,6 +216,9 @@ impl Scenario {
             summary.liars.iter().try_for_each(|liar| self.validate_name("summary.liars", liar))?;
         }
         self.validate_landmarks()?;
+        for (key, value, low, high, mend) in self.places.iter().flat_map(PlaceOptions::ranges) {
+            range(key, value, low, high, mend)?;
+        }
         range("expect.error_max_m", self.expect.error_max_m, 1e-6, 1e6, "use a positive length")?;
         range("expect.error_max_deg", self.expect.error_max_deg, 1e-6, 180.0, "use 0 to 180 degrees")?;
         for (key, value, low, high, mend) in self.network.ranges().into_iter().chain(self.radio.ranges()) {
@@ -338,6 +345,7 @@ mod tests {
             ("[config.submap]\nsensor = \"landmarks\"", "config.submap.sensor = Landmarks", "go together"),
             ("[landmarks]\n[config.submap]\nsensor = \"landmarks_2d\"", "= Landmarks2d", "go together"),
             ("[landmarks]\nseen = 1.1\n[config.submap]\nsensor = \"landmarks\"", "landmarks.seen = 1.1", "0 to 1"),
+            ("[places]\nnumbers = 1", "places.numbers = 1", "2 to 16384"),
             ("[landmarks]\nunit_m = [2.0, 1.0]\n[config.submap]\nsensor = \"landmarks\"", "unit_m[0] = 2", "then most"),
             (
                 "[landmarks]\nmetric = [\"delta\"]\n[config.submap]\nsensor = \"landmarks\"",

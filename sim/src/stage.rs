@@ -7,9 +7,11 @@ use crate::world::World;
 use crate::world::drive::{Step, drive};
 use crate::world::landmarks::{Camera, Sightings};
 use crate::world::path::Path;
+use crate::world::places::{PlaceOptions, Places};
 use crate::world::sensor::Sensor;
 use crate::world::trajectory::{Trajectory, TrajectoryError};
 use merganser_protocol::geometry::{CovarianceError, Se3};
+use merganser_protocol::submap::PlaceDescriptor;
 use merganser_protocol::wire::fact::ScaleKind;
 use thiserror::Error;
 
@@ -22,6 +24,8 @@ pub struct Stage {
     sensor: Sensor,
     /// Takes the sensor's place.
     camera: Option<Camera>,
+    /// Tells places beside it.
+    places: Option<Places>,
     /// What each robot's SLAM takes for one, m.
     units_m: Vec<f64>,
     /// Points of a made-up scan, at summary level.
@@ -85,9 +89,11 @@ impl Stage {
             let cell_m = scenario.world.aliased.then_some(scenario.world.cell_m);
             Camera::new(options.clone(), &world, &places, cell_m, &mut Dice::new(seed, "landmarks"))
         });
+        let of_network = |options: &PlaceOptions| Places::new(options.clone(), &mut Dice::new(seed, "places"));
+        let places = scenario.places.as_ref().map(of_network);
         let made_up = scenario.summary.as_ref().map(|summary| summary.points);
         let sensor = Sensor::new(scenario.sensor.clone());
-        Ok(Self { seed, names, world, sensor, camera, units_m, made_up, steps })
+        Ok(Self { seed, names, world, sensor, camera, places, units_m, made_up, steps })
     }
 
     /// The robots' names.
@@ -108,6 +114,13 @@ impl Stage {
     /// What one robot's SLAM takes for one, m.
     pub fn unit_m(&self, robot: usize) -> f64 {
         self.units_m[robot]
+    }
+
+    /// What a place-recognition network says of one keyframe, if one runs.
+    pub fn place(&self, robot: usize, index: usize) -> Option<PlaceDescriptor> {
+        let mut dice = Dice::new(self.seed, &format!("place {robot} {index}"));
+        let at = self.steps[robot][index].t_world_body.translation;
+        self.places.as_ref()?.look(&at, &mut dice).ok()
     }
 
     /// The points of one keyframe, body frame, in its SLAM's unit, and a mark for each if they are landmarks.

@@ -361,6 +361,7 @@ pub(super) fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             keyframes: 0,
             origin: "a test".into(),
             unit_m: track.unit_m.filter(|_| unknown),
+            places: None,
             config,
         };
         let mut writer = Writer::create(&folder.join(&track.name), manifest).unwrap();
@@ -373,7 +374,9 @@ pub(super) fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             let pose = PoseWithCovariance { pose: track.odometry[index], covariance: covariance() };
             let stamp = Stamp((track.stamps_secs[index] * 1e9) as i64);
             let covariance_of = CovarianceOf::Motion;
-            writer.push(&Keyframe { stamp, pose, covariance_of, points, marks: vec![] }, Some(truth)).unwrap();
+            writer
+                .push(&Keyframe { stamp, pose, covariance_of, points, marks: vec![], place: None }, Some(truth))
+                .unwrap();
         }
         writer.finish().unwrap();
     }

@@ -6,6 +6,7 @@ use crate::observation::COORDINATE_MAX;
 use merganser_protocol::config::ConfigError;
 use merganser_protocol::geometry::CovarianceError;
 use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, VERSION};
+use merganser_protocol::submap::PlaceError;
 use std::io;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
@@ -48,6 +49,19 @@ pub enum Problem {
     /// `unit_m` can be none.
     #[error("unit_m = {0}: state what one is in this recording, 0.001 to 1000 m, or leave it out")]
     UnitRange(f64),
+    /// `[places]` describes no vectors.
+    #[error("places.numbers: {0}")]
+    Place(PlaceError),
+    /// The file of place descriptors does not hold one for each keyframe.
+    #[error(
+        "{found} bytes instead of {expected}; write places.numbers little-endian f32 for each keyframe, NaN for none"
+    )]
+    PlacesLength {
+        /// Bytes of the file.
+        found: u64,
+        /// Bytes of a row for each keyframe.
+        expected: u64,
+    },
     /// The first line of a table is not the expected one.
     #[error("the columns are not the expected ones; the first line must be \"{0}\"")]
     Header(&'static str),

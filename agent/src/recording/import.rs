@@ -172,8 +172,14 @@ impl Cut<'_> {
             let mut writer = Writer::create(&folder, self.manifest(name).map_err(|problem| problem.of(&folder))?)?;
             for (scan, pose) in part.iter().zip(odometry) {
                 let covariance_of = CovarianceOf::Motion;
-                let keyframe =
-                    Keyframe { stamp: scan.stamp, pose, covariance_of, points: points(scan)?, marks: vec![] };
+                let keyframe = Keyframe {
+                    stamp: scan.stamp,
+                    pose,
+                    covariance_of,
+                    points: points(scan)?,
+                    marks: vec![],
+                    place: None,
+                };
                 writer.push(&keyframe, Some(&scan.truth))?;
             }
             writer.finish()?;
@@ -192,6 +198,7 @@ impl Cut<'_> {
             keyframes: 0,
             origin: format!("{}; laid on the true motion: {} (1 σ, seed {})", self.origin, self.drift, self.seed),
             unit_m: None,
+            places: None,
             config: self.config.clone(),
         })
     }

@@ -76,6 +76,7 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
             origin: "MRCLAM logs, whole; every other sighting of a landmark corrects the odometry, the others are handed over"
                 .into(),
             unit_m: None,
+            places: None,
             config: config.clone(),
         };
         let mut writer = Writer::create(&folder, manifest)?;

@@ -14,6 +14,7 @@ mod import_mrclam;
 mod import_rgbd;
 mod landmarks;
 mod pcd;
+mod places;
 pub mod ply;
 mod table;
 mod write;
@@ -36,6 +37,8 @@ pub const MANIFEST: &str = "recording.toml";
 pub const KEYFRAMES: &str = "keyframes.csv";
 /// Name of the table of true poses.
 pub const TRUTH: &str = "truth.csv";
+/// Name of the file of place descriptors.
+pub const PLACES: &str = "places.f32";
 /// Bytes of a manifest at most.
 const MANIFEST_BYTES_MAX: u64 = 1 << 20;
 
@@ -64,6 +67,9 @@ impl Recording {
             if !folder.join(&line.cloud).is_file() {
                 return Err(Problem::CloudMissing(line.cloud.display().to_string()).at(table, index + 2));
             }
+        }
+        if let Some(format) = &manifest.places {
+            places::check(&folder.join(PLACES), format, manifest.keyframes)?;
         }
         let truth = folder.join(TRUTH);
         let truth = if truth.exists() { Some(read_truth(&truth, &keyframes)?) } else { None };
@@ -134,7 +140,11 @@ impl Recording {
         } else {
             Vec::new()
         };
-        Ok(Keyframe { stamp: line.stamp, pose: line.pose, covariance_of, points, marks })
+        let place = match &self.manifest.places {
+            Some(format) => places::read(&self.folder.join(PLACES), format, index)?,
+            None => None,
+        };
+        Ok(Keyframe { stamp: line.stamp, pose: line.pose, covariance_of, points, marks, place })
     }
 
     fn line(&self, index: usize) -> Result<&KeyframeLine, RecordingError> {

@@ -22,6 +22,7 @@ fn write_good(folder: &Path, robot: &str) {
         keyframes: 0,
         origin: "a test".into(),
         unit_m: None,
+        places: None,
         config: Config::default(),
     };
     let mut writer = Writer::create(folder, manifest).unwrap();
@@ -38,6 +39,7 @@ fn write_good(folder: &Path, robot: &str) {
             covariance_of: CovarianceOf::Pose,
             points,
             marks: vec![],
+            place: None,
         };
         writer.push(&keyframe, Some(&pose.pose.inverse())).unwrap();
     }

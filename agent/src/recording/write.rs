@@ -4,7 +4,8 @@
 use super::cloud;
 use super::error::{Problem, RecordingError, on};
 use super::landmarks;
-use super::{KEYFRAMES, MANIFEST, TRUTH};
+use super::places::Rows;
+use super::{KEYFRAMES, MANIFEST, PLACES, TRUTH};
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::recording::{FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION};
 use merganser_protocol::submap::Keyframe;
@@ -22,6 +23,7 @@ pub struct Writer {
     manifest: Manifest,
     keyframes: String,
     truth: String,
+    places: Rows,
 }
 
 impl Writer {
@@ -34,7 +36,7 @@ impl Writer {
         on(folder, fs::create_dir_all(folder.join(CLOUDS)))?;
         let manifest = Manifest { format: FORMAT.into(), version: VERSION, keyframes: 0, ..manifest };
         let (keyframes, truth) = (format!("{KEYFRAMES_HEADER}\n"), format!("{TRUTH_HEADER}\n"));
-        Ok(Self { folder: folder.into(), manifest, keyframes, truth })
+        Ok(Self { folder: folder.into(), manifest, keyframes, truth, places: Rows::default() })
     }
 
     /// Adds a keyframe, with `t_world_body` where it is known: for all keyframes or for none.
@@ -52,6 +54,7 @@ impl Writer {
         };
         let bytes = bytes.map_err(|problem| problem.of(&path))?;
         on(&path, fs::write(&path, bytes))?;
+        self.places.push(keyframe.place.as_ref()).map_err(|problem| problem.of(self.folder.join(PLACES)))?;
         line(&mut self.keyframes, keyframe.stamp.0, &keyframe.pose.pose);
         let p = keyframe.pose.covariance.matrix();
         for (row, column) in (0..6).flat_map(|row| (row..6).map(move |column| (row, column))) {
@@ -71,23 +74,27 @@ impl Writer {
     ///
     /// # Errors
     /// [`RecordingError`] of the file system, or if truth was given for some keyframes only.
-    pub fn finish(self) -> Result<(), RecordingError> {
-        let write = |name: &str, text: &str| {
+    pub fn finish(mut self) -> Result<(), RecordingError> {
+        let write = |name: &str, bytes: &[u8]| {
             let path = self.folder.join(name);
-            on(&path, fs::write(&path, text))
+            on(&path, fs::write(&path, bytes))
         };
-        write(KEYFRAMES, &self.keyframes)?;
+        write(KEYFRAMES, self.keyframes.as_bytes())?;
+        if let Some((format, rows)) = self.places.finish() {
+            write(PLACES, rows)?;
+            self.manifest.places = Some(format);
+        }
         let truths = self.truth.lines().count() - 1;
         if truths != 0 {
             if truths != self.manifest.keyframes {
                 let problem = Problem::TruthCount { found: truths, keyframes: self.manifest.keyframes };
                 return Err(problem.of(self.folder.join(TRUTH)));
             }
-            write(TRUTH, &self.truth)?;
+            write(TRUTH, self.truth.as_bytes())?;
         }
         let manifest = toml::to_string(&self.manifest)
             .map_err(|error| Problem::Manifest(error.to_string()).of(self.folder.join(MANIFEST)))?;
-        write(MANIFEST, &manifest)
+        write(MANIFEST, manifest.as_bytes())
     }
 }
 

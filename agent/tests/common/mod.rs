@@ -167,5 +167,6 @@ pub fn keyframe(robot: u64, index: u64) -> Keyframe {
         covariance_of: CovarianceOf::Motion,
         points: points.collect(),
         marks: Vec::new(),
+        place: None,
     }
 }

@@ -345,7 +345,7 @@ impl Agent {
             .wishes
             .iter()
             .filter(|(pair, _)| reachable(pair) && !self.are_connected(pair.0, pair.1))
-            .max_by(|a, b| a.1.similarity.total_cmp(&b.1.similarity).then(b.0.cmp(&a.0)))
+            .max_by(|a, b| a.1.similarity.value.total_cmp(&b.1.similarity.value).then(b.0.cmp(&a.0)))
             .map(|(pair, _)| pair)?;
         self.negotiation.wishes.remove(best);
         Some(best)

@@ -293,12 +293,14 @@ impl Negotiation {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::submap::{Looks, Similarity};
 
     fn submap(robot: u8, index: u32) -> SubmapId {
         SubmapId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 1 }, index }
     }
 
     fn candidate(index: u32, similarity: f64) -> Candidate {
+        let similarity = Similarity { value: similarity, by: Looks::Summary };
         Candidate { mine: submap(1, 0), theirs: submap(2, index), similarity, wished: false }
     }
 
@@ -321,7 +323,7 @@ mod tests {
         for k in 0..10 {
             n.add_candidate(candidate(k, f64::from(k)), 5);
         }
-        let kept: Vec<u32> = n.ranked(|c| Some(c.similarity)).iter().map(|c| c.theirs.index).collect();
+        let kept: Vec<u32> = n.ranked(|c| Some(c.similarity.value)).iter().map(|c| c.theirs.index).collect();
         assert_eq!(kept, [9, 8, 7, 6, 5]);
     }
 

@@ -6,7 +6,7 @@ const SENSORS: [Sensor; 5] =
     [Sensor::Points3d, Sensor::Lidar3d, Sensor::Laser2d, Sensor::Landmarks, Sensor::Landmarks2d];
 
 fn signs(similarity: f64, apart: Option<f64>) -> Signs {
-    Signs { similarity, apart }
+    Signs { similarity: Similarity { value: similarity, by: Looks::Summary }, apart }
 }
 
 #[test]
@@ -75,7 +75,7 @@ fn nothing_that_comes_about_breaks_it() {
                 let Guess { probability, .. } = promise.guess(one);
                 assert!((0.0..=1.0).contains(&probability), "{sensor:?} after {k}: {probability}");
             }
-            assert!(promise.covariance.cholesky().is_some(), "{sensor:?}: {promise:?}");
+            assert!(promise.by_summary.covariance.cholesky().is_some(), "{sensor:?}: {promise:?}");
         }
     }
 }
@@ -89,4 +89,19 @@ fn what_was_learned_is_not_for_ever() {
     assert!(promise.guess(one).probability < 0.02);
     (0..8).for_each(|_| promise.learn(&one, true));
     assert!(promise.guess(one).probability > 0.2, "{}", promise.guess(one).probability);
+}
+
+/// What the user's own descriptors are worth is learned apart: neither spoils the other.
+#[test]
+fn each_kind_of_similarity_is_learned_for_itself() {
+    let by_place = |value| Signs { similarity: Similarity { value, by: Looks::Place }, apart: None };
+    let mut promise = Promise::new(Sensor::Lidar3d);
+    let before = promise.guess(signs(0.9, None));
+    for k in 0..200 {
+        let alike = k % 2 == 0;
+        promise.learn(&by_place(if alike { 0.6 } else { 0.4 }), alike);
+    }
+    let of = |value| promise.guess(by_place(value)).probability;
+    assert!(of(0.6) > 0.9 && of(0.4) < 0.1, "{} {}", of(0.6), of(0.4));
+    assert_eq!(promise.guess(signs(0.9, None)), before);
 }

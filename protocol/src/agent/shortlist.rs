@@ -2,6 +2,7 @@
 
 use super::knowledge::{Pair, pair_of};
 use crate::ids::SubmapId;
+use crate::submap::Similarity;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A pair worth trying.
@@ -11,8 +12,8 @@ pub struct Candidate {
     pub mine: SubmapId,
     /// The other one (a peer's, or ours for a loop).
     pub theirs: SubmapId,
-    /// Similarity of the summaries, 0 to 1.
-    pub similarity: f64,
+    /// Of the summaries.
+    pub similarity: Similarity,
     /// The other endpoint asked for it.
     pub wished: bool,
 }
@@ -80,16 +81,18 @@ impl Shortlist {
 
 /// Sorts as the similarity does, which is not negative.
 fn rank(candidate: &Candidate) -> u64 {
-    candidate.similarity.max(0.0).to_bits()
+    candidate.similarity.value.max(0.0).to_bits()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::ids::{FrameId, RobotId};
+    use crate::submap::Looks;
 
     fn candidate(index: u32, similarity: f64) -> Candidate {
         let submap = |robot, index| SubmapId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 1 }, index };
+        let similarity = Similarity { value: similarity, by: Looks::Summary };
         Candidate { mine: submap(1, 0), theirs: submap(2, index), similarity, wished: false }
     }
 
@@ -104,7 +107,7 @@ mod tests {
         offers.iter().for_each(|offer| forward.offer(*offer, 5));
         offers.iter().rev().for_each(|offer| backward.offer(*offer, 5));
         assert_eq!(kept(&forward), kept(&backward));
-        assert!(forward.iter().all(|(_, candidate)| candidate.similarity >= 0.8));
+        assert!(forward.iter().all(|(_, candidate)| candidate.similarity.value >= 0.8));
         assert_eq!(forward.least(5), 0.8);
         assert_eq!(forward.least(6), 0.0, "there is room");
     }

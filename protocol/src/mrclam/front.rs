@@ -103,7 +103,14 @@ pub fn keyframes(speeds: &[Speed], sightings: &[Sighting]) -> Vec<Keyframe> {
         let covariance = covariances.get(k.saturating_sub(1)).copied().unwrap_or_else(Matrix3::identity);
         let pose = PoseWithCovariance { pose: in_space(pose), covariance: local(&between(before, pose), &covariance) };
         let (points, marks) = handed.into_iter().map(handed_over).unzip();
-        keyframes.push(Keyframe { stamp: stamps[k], pose, covariance_of: CovarianceOf::Motion, points, marks });
+        keyframes.push(Keyframe {
+            stamp: stamps[k],
+            pose,
+            covariance_of: CovarianceOf::Motion,
+            points,
+            marks,
+            place: None,
+        });
     }
     keyframes
 }

@@ -8,9 +8,10 @@
 
 use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
 use super::odometry::{across_gap_after, isotropic, motion};
+use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
 use super::thinning::Thinner;
-use super::{Keyframe, Mark, PoseWithCovariance};
+use super::{Keyframe, Mark, PlaceDescriptor, PoseWithCovariance};
 use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
@@ -49,6 +50,8 @@ pub struct Submap {
     pub seen_from: Vec<u16>,
     /// Of landmarks: the points once more, and what else is known of them. Empty where points lie on surfaces.
     pub constellation: Constellation,
+    /// What the user's own place recognition says of it.
+    pub place: Option<Place>,
 }
 
 /// Why a keyframe was refused. The builder is as it was before; only the odometry across the refused keyframe becomes
@@ -103,6 +106,16 @@ pub enum KeyframeError {
         /// Position in the keyframe's points.
         index: usize,
     },
+    /// A place descriptor unlike those before.
+    #[error(
+        "the place vector has {numbers} numbers by {model:?}, unlike those before it; send one model, metric and length"
+    )]
+    OtherPlace {
+        /// Its numbers.
+        numbers: usize,
+        /// What made it.
+        model: String,
+    },
     /// More points than a keyframe may hold.
     #[error("keyframe has {count} points, at most {POINTS_PER_KEYFRAME_MAX} are accepted; thin it first")]
     TooManyPoints {
@@ -151,6 +164,7 @@ struct Open {
     /// About the first body pose, until it is known which is the middle one.
     cloud: Thinner,
     landmarks: Gatherer,
+    place: PlaceMean,
 }
 
 impl SubmapBuilder {
@@ -196,7 +210,7 @@ impl SubmapBuilder {
         };
         self.track(&keyframe, step);
         self.extend(&keyframe);
-        self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), ..keyframe });
+        self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), place: None, ..keyframe });
         self.gap = false;
         Ok(if self.is_complete() { self.flush() } else { None })
     }
@@ -247,6 +261,10 @@ impl SubmapBuilder {
         let in_range = |mark: &Mark| mark.covariance.sigmas().iter().all(|sigma| SIGMA_RANGE.contains(sigma));
         if let Some(index) = keyframe.marks.iter().position(|mark| !in_range(mark)) {
             return Err(KeyframeError::MarkOutOfRange { index });
+        }
+        let other = |place: &&PlaceDescriptor| self.open.as_ref().is_some_and(|open| !open.place.takes(place));
+        if let Some(place) = keyframe.place.as_ref().filter(other) {
+            return Err(KeyframeError::OtherPlace { numbers: place.vector().len(), model: place.model().into() });
         }
         let allowed = JUMP_SUBMAPS_MAX * self.config.distance_m;
         let moved =
@@ -305,12 +323,14 @@ impl SubmapBuilder {
                 keyframes: Vec::new(),
                 cloud: Thinner::new(self.config.voxel_m, self.config.points_max),
                 landmarks: Gatherer::new(self.config.voxel_m, self.config.points_max),
+                place: PlaceMean::default(),
             }
         });
         let t_first_body = open.t_frame_first.inverse() * t_frame_body;
         open.stamps[1] = keyframe.stamp;
         let position = u16::try_from(open.keyframes.len()).unwrap_or(u16::MAX);
         open.keyframes.push(t_first_body);
+        keyframe.place.iter().for_each(|place| open.place.add(place));
         match self.config.sensor {
             Sensor::Landmarks => open.landmarks.add(position, &t_first_body, &keyframe.points, &keyframe.marks),
             Sensor::Landmarks2d => {
@@ -374,6 +394,7 @@ impl Open {
             cloud,
             seen_from,
             constellation,
+            place: self.place.finish(),
         }
     }
 

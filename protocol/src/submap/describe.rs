@@ -35,11 +35,12 @@ pub struct Described {
 
 /// Normals, keypoints with descriptors, and summary of a submap.
 pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
-    match config.sensor {
+    let described = match config.sensor {
         Sensor::Points3d | Sensor::Lidar3d => in_space(submap, config),
         Sensor::Laser2d => planar::describe(submap, config),
         Sensor::Landmarks | Sensor::Landmarks2d => landmarks::describe(submap, config),
-    }
+    };
+    Described { summary: described.summary.at(submap.place.clone()), ..described }
 }
 
 fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {

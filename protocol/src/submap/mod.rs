@@ -23,6 +23,7 @@ pub mod landmarks;
 mod matching;
 mod near;
 mod odometry;
+pub mod place;
 pub mod planar;
 pub mod refine;
 pub mod register;
@@ -43,9 +44,10 @@ pub use describe::{Described, describe};
 pub use features::{Features, Keypoints};
 pub use landmarks::Mark;
 pub use matching::{Matches, fit, match_keypoints};
+pub use place::{PlaceDescriptor, PlaceError};
 pub use refine::{RefineConfig, RefineError, Refined, refine};
 pub use register::{RegisterConfig, RegisterError, Registered, register};
-pub use summary::{SUMMARY_LEN_MAX, Summary, SummaryError};
+pub use summary::{Looks, SUMMARY_LEN_MAX, Similarity, Summary, SummaryError};
 pub use visibility::contradiction;
 
 use crate::geometry::PoseWithCovariance;
@@ -64,6 +66,8 @@ pub struct Keyframe {
     pub points: Vec<[f32; 3]>,
     /// Of landmarks: what else is known of each point. Empty where points lie on surfaces.
     pub marks: Vec<Mark>,
+    /// What the user's own place recognition says of it, if it has one.
+    pub place: Option<PlaceDescriptor>,
 }
 
 /// What a keyframe's covariance describes.

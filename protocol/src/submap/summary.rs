@@ -6,8 +6,12 @@
 //! It ranks candidates, no more. Measured average precision (that of chance in brackets): pairs of scans of two streets
 //! 0.9 (0.27), parts of eight halls furnished alike 0.5 (0.10). Histograms of single numbers did better than those of
 //! words (signs of seven numbers, 0.84 and 0.34), of means, and of second moments.
+//!
+//! Behind it may follow the user's own descriptor of the [`place`]; where two summaries have one of the same kind, these
+//! are compared instead.
 
 use super::descriptor::{Code, Projection};
+use super::place::{self, Place};
 use crate::config::Sensor;
 use thiserror::Error;
 
@@ -27,9 +31,11 @@ const LEVELS: usize = 8;
 /// Shares.
 pub(super) const WORDS: usize = NUMBERS * LEVELS;
 /// Version, numbers, voxel.
-const HEADER_LEN: usize = 6;
-/// Bytes of an encoded summary.
+pub(super) const HEADER_LEN: usize = 6;
+/// Bytes of an encoded summary without a place.
 const LEN: usize = HEADER_LEN + WORDS;
+/// Set in the version of a summary that a place follows.
+const WITH_PLACE: u8 = 0x80;
 /// Accepted voxel edges, frame units.
 const VOXEL_RANGE: core::ops::RangeInclusive<f32> = 1e-4..=1e3;
 /// Clouds thinned to voxels that differ by more than this factor are not compared, nor their summaries.
@@ -49,13 +55,33 @@ pub struct Summary {
     words: [u8; WORDS],
     /// Sum of their squares.
     square: u32,
+    /// What the user's own front end says of the place.
+    place: Option<Place>,
+}
+
+/// How alike two submaps are, and what says so.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Similarity {
+    /// 0 to 1.
+    pub value: f64,
+    /// What was compared.
+    pub by: Looks,
+}
+
+/// What the similarity of two submaps is judged by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Looks {
+    /// Our summaries.
+    Summary,
+    /// Descriptors of the user's own.
+    Place,
 }
 
 /// Why bytes are no summary.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum SummaryError {
     /// The length is not that of a summary.
-    #[error("a summary has {LEN} bytes, not {len}; it was cut or padded")]
+    #[error("a summary has {LEN} bytes, or more with a place, not {len}; it was cut or padded")]
     WrongLength {
         /// How many bytes there are.
         len: usize,
@@ -71,6 +97,9 @@ pub enum SummaryError {
     /// The voxel edge is not a usable number, or the histogram is not scaled to its largest share.
     #[error("summary is not in canonical form; its writer is faulty")]
     NotCanonical,
+    /// What follows is no place.
+    #[error("the place at the end of a summary is not in canonical form; its writer is faulty")]
+    Place,
 }
 
 impl Summary {
@@ -115,31 +144,39 @@ impl Summary {
     }
 
     fn new(version: u8, voxel: f32, words: [u8; WORDS]) -> Self {
-        Self { version, voxel, words, square: dot(&words, &words) }
+        Self { version, voxel, words, square: dot(&words, &words), place: None }
+    }
+
+    /// The same, with what the user's own front end says of the place.
+    #[must_use]
+    pub(super) fn at(self, place: Option<Place>) -> Self {
+        Self { place, ..self }
     }
 
     /// How alike two submaps look: 0 (nothing in common, or thinned to different voxels) to 1 (equal). Symmetric. Real
     /// submaps of one kind of place lie between 0.6 and 0.9.
     pub fn similarity(&self, other: &Self) -> f64 {
-        self.similarity_from(other, 0.0).unwrap_or(0.0)
+        self.similarity_from(other, 0.0).map_or(0.0, |similarity| similarity.value)
     }
 
-    /// [`Summary::similarity`], unless it is below `least`. Most pairs of a large swarm are, and no root is drawn then.
-    pub fn similarity_from(&self, other: &Self, least: f64) -> Option<f64> {
+    /// [`Summary::similarity`], unless it is below `least`, and what says so.
+    pub fn similarity_from(&self, other: &Self, least: f64) -> Option<Similarity> {
+        let by_place = || self.place.as_ref()?.similarity(other.place.as_ref()?);
+        let (value, by) = match by_place() {
+            Some(value) if self.is_comparable(other) => (value, Looks::Place),
+            _ => (self.similarity_of_words(other, least)?, Looks::Summary),
+        };
+        (value >= least).then_some(Similarity { value, by })
+    }
+
+    /// By our own descriptors. Most pairs of a large swarm are below `least`, and no root is drawn then.
+    fn similarity_of_words(&self, other: &Self, least: f64) -> Option<f64> {
         let dot = f64::from(dot(&self.words, &other.words));
         let squares = f64::from(self.square) * f64::from(other.square);
         // 1 − √(1 − dot/√squares) ≥ least, solved for dot².
         let bound = 1.0 - (1.0 - least) * (1.0 - least);
         let surely_below = dot * dot < bound * bound * squares * ROUNDING;
-        let ratio = f64::from(self.voxel) / f64::from(other.voxel);
-        // The labels of landmarks do not depend on a voxel, whose unit may be anything.
-        let comparable = match (self.version, other.version) {
-            (LANDMARKS, LANDMARKS) => true,
-            (a, b) => {
-                (a == LANDMARKS) == (b == LANDMARKS) && (1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio)
-            }
-        };
-        if surely_below || squares == 0.0 || !comparable {
+        if surely_below || squares == 0.0 || !self.is_comparable(other) {
             return (least <= 0.0).then_some(0.0);
         }
         let bhattacharyya = (dot / squares.sqrt()).clamp(0.0, 1.0);
@@ -147,11 +184,25 @@ impl Summary {
         (similarity >= least).then_some(similarity)
     }
 
+    /// Whether the two submaps could be aligned at all, by what they are made of.
+    fn is_comparable(&self, other: &Self) -> bool {
+        let ratio = f64::from(self.voxel) / f64::from(other.voxel);
+        // The labels of landmarks do not depend on a voxel, whose unit may be anything.
+        match (self.version, other.version) {
+            (LANDMARKS, LANDMARKS) => true,
+            (a, b) => {
+                (a == LANDMARKS) == (b == LANDMARKS) && (1.0 / VOXEL_RATIO_MAX..=VOXEL_RATIO_MAX).contains(&ratio)
+            }
+        }
+    }
+
     /// The summary as bytes, at most [`SUMMARY_LEN_MAX`].
     pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = vec![self.version, NUMBERS as u8];
+        let mark = if self.place.is_some() { WITH_PLACE } else { 0 };
+        let mut bytes = vec![self.version | mark, NUMBERS as u8];
         bytes.extend(self.voxel.to_le_bytes());
         bytes.extend(self.words);
+        bytes.extend(self.place.iter().flat_map(Place::encode));
         bytes
     }
 
@@ -161,20 +212,27 @@ impl Summary {
     /// [`SummaryError`], naming the first check that failed.
     pub fn decode(bytes: &[u8]) -> Result<Self, SummaryError> {
         if let [version, numbers, ..] = *bytes
-            && (!matches!(version, VERSION | LANDMARKS | RANGES) || usize::from(numbers) != NUMBERS)
+            && (!matches!(version & !WITH_PLACE, VERSION | LANDMARKS | RANGES) || usize::from(numbers) != NUMBERS)
         {
             return Err(SummaryError::UnknownLayout { version, numbers });
         }
         let wrong_length = SummaryError::WrongLength { len: bytes.len() };
-        let (header, words) = bytes.split_first_chunk::<HEADER_LEN>().ok_or(wrong_length.clone())?;
+        let (header, rest) = bytes.split_first_chunk::<HEADER_LEN>().ok_or(wrong_length.clone())?;
         let [version, _, v0, v1, v2, v3] = *header;
         let voxel = f32::from_le_bytes([v0, v1, v2, v3]);
-        let words: [u8; WORDS] = words.try_into().map_err(|_| wrong_length)?;
+        let (words, rest) = rest.split_first_chunk::<WORDS>().ok_or(wrong_length.clone())?;
+        let words = *words;
+        let place = match version & WITH_PLACE {
+            0 if rest.is_empty() => None,
+            0 => return Err(wrong_length),
+            _ if rest.len() > place::LEN_MAX => return Err(wrong_length),
+            _ => Some(Place::decode(rest).ok_or(SummaryError::Place)?),
+        };
         let scaled = matches!(words.iter().fold(0, |most, &word| word.max(most)), 0 | 255);
         if !VOXEL_RANGE.contains(&voxel) || !scaled {
             return Err(SummaryError::NotCanonical);
         }
-        Ok(Self::new(version, voxel, words))
+        Ok(Self::new(version & !WITH_PLACE, voxel, words).at(place))
     }
 }
 

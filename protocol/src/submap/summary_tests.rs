@@ -18,12 +18,12 @@ fn a_similarity_below_what_is_wanted_is_not_told_and_one_that_is_not_is() {
     let (a, b) = (room(1).summary, room(2).summary);
     let similarity = a.similarity(&b);
     for least in [0.0, similarity / 2.0, similarity] {
-        assert_eq!(a.similarity_from(&b, least), Some(similarity));
+        assert_eq!(a.similarity_from(&b, least), Some(Similarity { value: similarity, by: Looks::Summary }));
     }
     for least in [similarity + 1e-12, similarity + 0.1, 1.0] {
         assert_eq!(a.similarity_from(&b, least), None);
     }
-    assert_eq!(a.similarity_from(&a, 1.0), Some(1.0));
+    assert_eq!(a.similarity_from(&a, 1.0), Some(Similarity { value: 1.0, by: Looks::Summary }));
 }
 
 #[test]

@@ -123,6 +123,7 @@ pub fn drive(world: &World, k: usize, count: usize) -> (Vec<Keyframe>, Vec<Se3>)
             covariance_of: CovarianceOf::Motion,
             points: world.scan(&pose, 7 * n as u64 + 1000 * k as u64),
             marks: Vec::new(),
+            place: None,
         });
         truth.push(pose);
     }

@@ -114,7 +114,14 @@ pub fn described() -> &'static (Vec<u8>, Vec<u8>) {
         let mut builder = SubmapBuilder::new(config().submap);
         let points = scan(1, SCAN);
         builder
-            .push(Keyframe { stamp: Stamp(1), pose, covariance_of: CovarianceOf::Motion, points, marks: Vec::new() })
+            .push(Keyframe {
+                stamp: Stamp(1),
+                pose,
+                covariance_of: CovarianceOf::Motion,
+                points,
+                marks: Vec::new(),
+                place: None,
+            })
             .unwrap();
         let described = submap::describe(&builder.flush().unwrap(), &config().submap);
         (described.keypoints.encode(), described.summary.encode())

@@ -11,7 +11,8 @@ use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, JobId, Qu
 use merganser_protocol::agent::job::{JobResult, Measured};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::ids::RobotId;
-use merganser_protocol::submap::{CovarianceOf, Keyframe};
+use merganser_protocol::submap::place::Metric;
+use merganser_protocol::submap::{CovarianceOf, Keyframe, PlaceDescriptor};
 use merganser_protocol::time::{Instant, Stamp};
 use merganser_protocol::wire::Message;
 use merganser_protocol::wire::fact::RefusalReason;
@@ -284,9 +285,19 @@ impl<'m, M: Meter> Story<'m, M> {
         if look % 16 == 15 {
             points.push(r.numbers::<3>().map(|x| x as f32));
         }
+        let place = (look % 8 == 3).then(|| {
+            let metric = if r.byte() < 250 { Metric::Cosine } else { Metric::Euclidean };
+            PlaceDescriptor::new("", metric, r.numbers::<5>().map(|x| x as f32).to_vec()).ok()
+        });
         let covariance_of = if look % 32 == 1 { CovarianceOf::Pose } else { CovarianceOf::Motion };
-        let keyframe =
-            Keyframe { stamp: Stamp(self.stamp), pose: forge::pose(r), covariance_of, points, marks: Vec::new() };
+        let keyframe = Keyframe {
+            stamp: Stamp(self.stamp),
+            pose: forge::pose(r),
+            covariance_of,
+            points,
+            marks: Vec::new(),
+            place: place.flatten(),
+        };
         self.give(k, Input::Keyframe(keyframe));
     }
 

@@ -55,7 +55,9 @@ pub fn place_drifted(config: &SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>
         let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
         let pose = PoseWithCovariance { pose, covariance };
         let stamp = Stamp(k as i64 + 1);
-        builder.push(Keyframe { stamp, pose, covariance_of: CovarianceOf::Motion, points, marks: Vec::new() }).unwrap();
+        builder
+            .push(Keyframe { stamp, pose, covariance_of: CovarianceOf::Motion, points, marks: Vec::new(), place: None })
+            .unwrap();
     }
     let submap = builder.flush().unwrap();
     let t_world_anchor = truth[submap.keyframes.iter().position(|t| t.log().amax() < 1e-9).unwrap()];

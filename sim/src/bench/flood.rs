@@ -104,6 +104,7 @@ fn scenario(robots: usize, flooded: bool) -> Scenario {
     config.align.candidates_max = 24;
     let mut scenario = Scenario {
         landmarks: None,
+        places: None,
         radio: Layout::Mesh,
         name: "flood".into(),
         about: "halves that heal in a flood of strangers".into(),

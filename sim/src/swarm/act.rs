@@ -11,7 +11,7 @@ use crate::world::drive::Step;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, Output, QueryKind};
 use merganser_protocol::agent::job::{Job, JobResult};
 use merganser_protocol::geometry::Se3;
-use merganser_protocol::submap::Submap;
+use merganser_protocol::submap::{Keyframe, Submap};
 use merganser_protocol::time::Instant;
 
 /// A timeout is never nearer than this, so that virtual time moves even under a core that is always due.
@@ -20,7 +20,7 @@ const WAKE_NANOS_MIN: u64 = 1_000;
 impl<C: Core> Swarm<C> {
     fn publish(&mut self, now: Instant, robot: usize, channel: Channel, bytes: Vec<u8>) {
         let bytes = self.in_its_version(robot, bytes);
-        self.robots[robot].count(channel_name(channel), bytes.len());
+        self.robots[robot].count(now, channel_name(channel), bytes.len());
         let one = &self.robots[robot];
         let tells_two = one.equivocates && channel == Channel::Facts;
         let other = tells_two.then(|| hostile::second_story(&bytes, &one.identity.secret_key)).flatten();
@@ -196,7 +196,7 @@ impl<C: Core> Swarm<C> {
         }
         let seen = self.stopwatch.time("scan", || self.stage.scan(drive, index));
         let keyframe = match seen.and_then(|seen| one.slam.keyframe(step, seen)) {
-            Ok(keyframe) => keyframe,
+            Ok(keyframe) => Keyframe { place: self.stage.place(drive, index), ..keyframe },
             Err(error) => return self.object("stage", error.to_string()),
         };
         one.keyframes += 1;
@@ -267,7 +267,7 @@ impl<C: Core> Swarm<C> {
             Output::Ask { query, peer, kind, bytes } => {
                 let bytes = self.in_its_version(robot, bytes);
                 let one = &mut self.robots[robot];
-                one.count(ask_name(kind), bytes.len());
+                one.count(now, ask_name(kind), bytes.len());
                 one.questions.insert(query);
                 let Some(&to) = self.ids.get(&peer).filter(|&&to| to != robot) else {
                     self.queue.push(now, Event::Answer { to: robot, incarnation, query, bytes: None });
@@ -289,7 +289,7 @@ impl<C: Core> Swarm<C> {
                 // One that nobody asked for is the contract check's business.
                 let Some(asked) = self.robots[robot].asked.remove(&token.0) else { return };
                 let bytes = self.in_its_version(robot, bytes);
-                self.robots[robot].count(asked.kind, bytes.len());
+                self.robots[robot].count(now, asked.kind, bytes.len());
                 // The first to come counts: a mangled one may be it.
                 if let Some((at, bytes)) = self.tamper(now, robot, asked.from, &bytes) {
                     let (to, incarnation, query) = (asked.from, asked.incarnation, asked.query);

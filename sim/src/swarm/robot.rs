@@ -1,10 +1,12 @@
 //! One robot of a run: its key, its process (if it runs), its disk, its SLAM and what its shell remembers.
 
 use super::store::Store;
+use crate::network::millis;
 use crate::scenario::{MachineOptions, Scenario};
 use crate::stage::Stage;
 use crate::world::drive::Step;
 use crate::world::landmarks::Sightings;
+use core::ops::Range;
 use ed25519_dalek::SigningKey;
 use merganser_protocol::agent::Identity;
 use merganser_protocol::agent::io::{QueryId, Record};
@@ -61,6 +63,8 @@ pub(super) struct Robot<C> {
     /// Whom it hears, or once heard.
     pub hears: BTreeMap<usize, Hearing>,
     pub usage: BTreeMap<&'static str, Usage>,
+    /// The second half of the drive.
+    later: Range<Instant>,
     pub keyframes: u64,
 }
 
@@ -99,11 +103,14 @@ pub struct Usage {
     pub messages: u64,
     /// Bytes of payload.
     pub bytes: u64,
+    /// Those of them that were sent in the second half of the drive, when most of it is no longer new.
+    pub later: u64,
 }
 
 impl<C> Robot<C> {
     pub fn new(identity: Identity, id: RobotId, slam: Slam, scenario: &Scenario) -> Self {
         let owner = Owner { swarm: identity.swarm.clone(), robot: identity.name.clone(), id };
+        let [middle, end] = [0.5, 1.0].map(|part| Instant::ZERO.after(millis(part * scenario.duration_secs * 1e3)));
         Self {
             name: identity.name.clone(),
             id,
@@ -128,6 +135,7 @@ impl<C> Robot<C> {
             workers: vec![Instant::ZERO; scenario.machine.workers],
             hears: BTreeMap::new(),
             usage: BTreeMap::new(),
+            later: middle..end,
             keyframes: 0,
         }
     }
@@ -190,10 +198,11 @@ impl<C> Robot<C> {
         self.new_frame = self.new_frame.filter(|told| !matches!(told, NewFrame::Closing(batch) if *batch <= up_to));
     }
 
-    pub fn count(&mut self, kind: &'static str, bytes: usize) {
+    pub fn count(&mut self, now: Instant, kind: &'static str, bytes: usize) {
         let usage = self.usage.entry(kind).or_default();
         usage.messages += 1;
         usage.bytes += bytes as u64;
+        usage.later += if self.later.contains(&now) { bytes as u64 } else { 0 };
     }
 }
 
@@ -276,6 +285,7 @@ impl Slam {
             covariance_of: CovarianceOf::Motion,
             points,
             marks,
+            place: None,
         })
     }
 

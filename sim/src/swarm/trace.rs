@@ -91,7 +91,8 @@ fn keyframe_digest(keyframe: &Keyframe) -> [u8; 32] {
     for x in floats.chain(keyframe.pose.covariance.matrix().iter().copied()) {
         hasher.update(&x.to_bits().to_le_bytes());
     }
-    for x in keyframe.points.iter().flatten() {
+    let place = keyframe.place.iter().flat_map(|place| place.vector());
+    for x in keyframe.points.iter().flatten().chain(place) {
         hasher.update(&x.to_bits().to_le_bytes());
     }
     *hasher.finalize().as_bytes()

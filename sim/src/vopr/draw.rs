@@ -49,6 +49,7 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
     let solve = dice.chance(SOLVE_SHARE);
     let mut scenario = Scenario {
         landmarks: None,
+        places: None,
         name: format!("vopr-{seed}"),
         about: "drawn from the seed".into(),
         robots,

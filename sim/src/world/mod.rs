@@ -8,6 +8,7 @@ mod generate;
 mod grid;
 pub mod landmarks;
 pub mod path;
+pub mod places;
 pub mod sensor;
 pub mod shape;
 mod streets;

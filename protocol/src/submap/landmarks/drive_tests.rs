@@ -17,7 +17,7 @@ fn config(sensor: Sensor) -> SubmapConfig {
 fn keyframe(stamp: i64, pose: Se3, points: Vec<[f32; 3]>, marks: Vec<Mark>) -> Keyframe {
     let covariance = Covariance::from_sigmas(MOTION).unwrap();
     let pose = PoseWithCovariance { pose, covariance };
-    Keyframe { stamp: Stamp(stamp), pose, covariance_of: CovarianceOf::Motion, points, marks }
+    Keyframe { stamp: Stamp(stamp), pose, covariance_of: CovarianceOf::Motion, points, marks, place: None }
 }
 
 /// Standard deviations of a keyframe's motion in these tests.
