@@ -17,7 +17,7 @@ pub(super) fn check(path: &Path, format: &PlaceFormat, keyframes: usize) -> Resu
         return Err(Problem::Place(PlaceError::Length(format.numbers)).of(path));
     }
     let found = on(path, std::fs::metadata(path))?.len();
-    let expected = (keyframes * format.numbers * NUMBER_LEN) as u64;
+    let expected = keyframes as u64 * (format.numbers * NUMBER_LEN) as u64;
     if found == expected { Ok(()) } else { Err(Problem::PlacesLength { found, expected }.of(path)) }
 }
 
@@ -25,7 +25,7 @@ pub(super) fn check(path: &Path, format: &PlaceFormat, keyframes: usize) -> Resu
 pub(super) fn read(path: &Path, format: &PlaceFormat, index: usize) -> Result<Option<PlaceDescriptor>, RecordingError> {
     let mut row = vec![0; format.numbers * NUMBER_LEN];
     let mut file = on(path, File::open(path))?;
-    on(path, file.seek(SeekFrom::Start((index * row.len()) as u64)))?;
+    on(path, file.seek(SeekFrom::Start(index as u64 * row.len() as u64)))?;
     on(path, file.read_exact(&mut row))?;
     let numbers: Vec<f32> = row.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
     if numbers.iter().all(|x| x.is_nan()) {

@@ -4,9 +4,10 @@
 //! the odometry that joins their ends (pairwise consistency, Mangelson et al. 2018, with odometry segments taken as
 //! independent; of many, each with a fixed number of others, so that the cost grows with their number). Of closures that contradict each other, the one with the most contradictions goes first.
 
-use super::intake::{Chain, Intake, Kind};
+use super::intake::{Intake, Kind};
 use super::joint::Unused;
 use super::reweight::CHI2_999;
+use super::trajectory::Trajectory;
 use super::ways::{Way, Ways, compose, inverse};
 use crate::geometry::{Covariance, PoseWithCovariance};
 use crate::ids::FrameId;
@@ -52,7 +53,7 @@ pub(super) fn gate(intake: &mut Intake) {
             }
             good
         });
-        refused.extend(outvoted(chain, &closures).into_iter().map(|edge| (edge, Unused::OtherLoops)));
+        refused.extend(outvoted(&chain.trajectory, &closures).into_iter().map(|edge| (edge, Unused::OtherLoops)));
         for (edge, reason) in refused {
             intake.edges[edge].refuse(reason);
         }
@@ -60,10 +61,10 @@ pub(super) fn gate(intake: &mut Intake) {
 }
 
 /// Edges of the closures to be left out so that the rest agree with those that they are compared with.
-fn outvoted(chain: &Chain, closures: &[Closure]) -> Vec<usize> {
+fn outvoted(trajectory: &Trajectory, closures: &[Closure]) -> Vec<usize> {
     let n = closures.len().min(CLOSURES_COMPARED_MAX);
     let mut conflicts = vec![Vec::new(); n];
-    let ways = Ways::new(&chain.trajectory, closures[..n].iter().flat_map(|c| [c.i, c.j]));
+    let ways = Ways::new(trajectory, closures[..n].iter().flat_map(|c| [c.i, c.j]));
     for (l, closure) in closures[..n].iter().enumerate() {
         let around = Around::of(closure, &ways);
         for m in compared(n, l) {
@@ -122,7 +123,35 @@ impl<'a> Around<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Se3;
+    use crate::geometry::test_support::rng;
+    use nalgebra::Vector6;
+    use rand::Rng;
     use std::collections::BTreeSet;
+
+    /// Far more closures than are compared with one another, every tenth false, each in its own way, by no more than the
+    /// odometry allows.
+    #[test]
+    fn the_false_ones_of_many_are_left_out_and_no_others() {
+        let mut rng = rng(77);
+        let mut noise = |sigma: f64| Se3::exp(&Vector6::from_fn(|_, _| sigma * (rng.next_u32() as f64 / 2e9 - 1.0)));
+        let step = Se3::exp(&Vector6::new(1.0, 0.0, 0.0, 0.0, 0.0, 0.3));
+        let of = |pose, sigma| PoseWithCovariance { pose, covariance: Covariance::from_sigmas([sigma; 6]).unwrap() };
+        let drift = 0.02;
+        let odometry = Trajectory::new((0..120).map(|_| of(step, drift)));
+        let mut truth = vec![step];
+        (1..120).for_each(|k| truth.push(truth[k - 1] * step * noise(drift)));
+        let closure = |edge: usize| {
+            let (i, j) = (edge % 50, 60 + (edge * 7) % 60);
+            let exact = truth[i].inverse() * truth[j] * noise(0.005);
+            let pose = if edge % 10 == 3 { exact * noise(0.4) } else { exact };
+            Closure { edge, i, j, t_i_j: of(pose, 0.01) }
+        };
+        let closures: Vec<Closure> = (0..200).map(closure).collect();
+        let mut found = outvoted(&odometry, &closures);
+        found.sort_unstable();
+        assert_eq!(found, (0..200).filter(|edge| edge % 10 == 3).collect::<Vec<_>>());
+    }
 
     #[test]
     fn few_are_all_compared_once_and_each_of_many_with_as_many_others() {

@@ -2,9 +2,9 @@
 //! how two of them are compared. A submap's is the mean of its keyframes'; it travels in the summary, a byte a number, and
 //! where two submaps have one of the same kind it takes our own descriptor's place in proposing what to align.
 //!
-//! Longer vectors are folded to [`NUMBERS_MAX`] numbers by signed hashing (Weinberger et al. 2009, "Feature hashing"): inner
-//! products, hence lengths and distances too, stay what they are but for 1/16 of the vectors' lengths (one standard
-//! deviation). Whiten and shorten them yourself if you can do better.
+//! Longer vectors are folded to [`NUMBERS_MAX`] numbers by signed hashing (Weinberger et al. 2009, "Feature hashing"): a
+//! cosine c stays what it is but for (1 − c²) / 16, a distance but for 1/23 of itself (one standard deviation). Whiten and
+//! shorten them yourself if you can do better.
 
 use super::summary::WORDS;
 use serde::{Deserialize, Serialize};

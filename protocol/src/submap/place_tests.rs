@@ -71,6 +71,18 @@ fn folding_keeps_cosines_on_average() {
     assert!(mean.abs() < 0.01 && sigma < 1.0 / 16.0, "off by {mean:.3} with a standard deviation of {sigma:.3}");
 }
 
+/// Numbers that are never negative, as of many networks: without signs all would look alike.
+#[test]
+fn folding_keeps_apart_what_has_a_mean() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    for _ in 0..20 {
+        let [a, b] = [(); 2].map(|()| vector(&mut rng, 2048).into_iter().map(f32::abs).collect::<Vec<f32>>());
+        let found = place(Metric::Cosine, &a).similarity(&place(Metric::Cosine, &b)).unwrap();
+        let expected = exact(Metric::Cosine, &a, &b);
+        assert!((found - expected).abs() < 0.15, "{found}, not {expected}");
+    }
+}
+
 #[test]
 fn only_one_kind_is_compared() {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
