@@ -11,7 +11,7 @@ use merganser_protocol::config::EstimateConfig;
 use merganser_protocol::estimate::joint::{AgreedAlignment, FrameChain, MapProblem, solve_map};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
 use merganser_protocol::ids::{EntryId, FrameId, RobotId, SubmapId};
-use merganser_protocol::snapshot::Snapshot;
+use merganser_protocol::snapshot::{EdgeView, Snapshot};
 use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::Vector6;
 use std::collections::{BTreeMap, BTreeSet};
@@ -21,31 +21,25 @@ const LOOPS_PER_SUBMAP: usize = 6;
 /// Submaps of one robot so near in its chain are no loop.
 const LOOP_GAP: u32 = 5;
 
-/// Root mean square errors of the alignments that the swarm uses, m and rad and per axis, and what they count as.
-pub(super) struct Errors {
-    pub(super) true_ones: (f64, f64),
-    pub(super) claimed: (f64, f64),
+/// What the alignments that the swarm uses count as: root mean square, m and rad and per axis; `None` for none.
+pub(super) fn claimed(snapshot: &Snapshot) -> Option<(f64, f64)> {
+    let used: Vec<_> = snapshot.graph.edges.iter().filter(|edge| edge.weight > 0.0).collect();
+    let mean = |from: usize| {
+        let variance = |edge: &&EdgeView| square::<6>(&edge.t_i_j.covariance).diagonal() / edge.weight;
+        used.iter().map(|edge| variance(edge).fixed_rows::<3>(from).mean()).sum::<f64>() / used.len() as f64
+    };
+    (!used.is_empty()).then(|| (mean(0).sqrt(), mean(3).sqrt()))
 }
 
-/// Of all alignments that the swarm uses; `None` for none.
-pub(super) fn alignment_errors(snapshot: &Snapshot, anchors: &[Anchor]) -> Option<Errors> {
-    let names: BTreeMap<&str, &Se3> = anchors.iter().map(|a| (a.name.as_str(), &a.t_world_anchor)).collect();
-    let (mut squares, mut claimed, mut count) = ((0.0, 0.0), (0.0, 0.0), 0.0);
-    for edge in snapshot.graph.edges.iter().filter(|edge| edge.weight > 0.0) {
-        let ends = [&edge.i, &edge.j].map(|name| names.get(name.as_str()));
-        let ([Some(i), Some(j)], Some(t)) = (ends, rigid(&edge.t_i_j.pose)) else {
-            continue;
-        };
-        let off = t.local(&(i.inverse() * **j));
-        squares.0 += off.fixed_rows::<3>(0).norm_squared() / 3.0;
-        squares.1 += off.fixed_rows::<3>(3).norm_squared() / 3.0;
-        let variances = square::<6>(&edge.t_i_j.covariance).diagonal() / edge.weight;
-        claimed.0 += variances.fixed_rows::<3>(0).mean();
-        claimed.1 += variances.fixed_rows::<3>(3).mean();
-        count += 1.0;
-    }
-    let root = |sums: (f64, f64)| ((sums.0 / count).sqrt(), (sums.1 / count).sqrt());
-    (count > 0.0).then(|| Errors { true_ones: root(squares), claimed: root(claimed) })
+/// Root mean square errors of measurements, m and rad and per axis; `None` for none.
+pub(super) fn rms(anchors: &[Anchor], measured: &[(usize, usize, Se3)]) -> Option<(f64, f64)> {
+    let off = |&(i, j, t): &(usize, usize, Se3)| {
+        let off = t.local(&(anchors[i].t_world_anchor.inverse() * anchors[j].t_world_anchor));
+        [0, 3].map(|from| off.fixed_rows::<3>(from).norm_squared() / 3.0)
+    };
+    let sums = measured.iter().map(off).fold([0.0; 2], |sums, one| [sums[0] + one[0], sums[1] + one[1]]);
+    let [metres, radians] = sums.map(|sum| (sum / measured.len() as f64).sqrt());
+    (!measured.is_empty()).then_some((metres, radians))
 }
 
 /// Pairs of anchors that overlap.
