@@ -6,7 +6,9 @@
 //! is a pure function of its data, so the replay runs it again. A frame that a crash cut short ends the journal.
 
 use crate::observation::{KeyframeMessage, ObservationError};
-use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, JobId, QueryId, QueryKind, Record, Sighting};
+use merganser_protocol::agent::io::{
+    AskToken, Channel, Command, Input, JobId, PositionSighting, QueryId, QueryKind, Record, Sighting,
+};
 use merganser_protocol::agent::{Identity, Restored};
 use merganser_protocol::config::Config;
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
@@ -131,6 +133,8 @@ pub enum StoredInput {
     Timeout,
     /// See [`Input::Command`].
     Command(Command),
+    /// See [`Input::Position`].
+    Position(PositionSighting),
 }
 
 impl From<&Input> for StoredInput {
@@ -147,6 +151,7 @@ impl From<&Input> for StoredInput {
             Input::JobDone { job, .. } => Self::JobDone(*job),
             Input::Timeout => Self::Timeout,
             Input::Command(command) => Self::Command(*command),
+            Input::Position(sighting) => Self::Position(sighting.clone()),
         }
     }
 }
@@ -178,6 +183,7 @@ impl StoredInput {
             Self::JobDone(job) => return Ok(Replayed::JobDone(job)),
             Self::Timeout => Input::Timeout,
             Self::Command(command) => Input::Command(command),
+            Self::Position(sighting) => Input::Position(sighting),
         })))
     }
 }

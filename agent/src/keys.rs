@@ -21,7 +21,7 @@ pub const VIEWS: [&str; 6] = ["status", "frames", "poses", "map", "graph", "stat
 /// Last part of a robot's liveliness key.
 pub const ALIVE: &str = "alive";
 /// What a robot's own SLAM sends.
-pub const INPUTS: [&str; 2] = ["keyframe", "sighting"];
+pub const INPUTS: [&str; 3] = ["keyframe", "sighting", "position"];
 
 /// The last part of a channel's keys.
 pub fn channel(channel: Channel) -> &'static str {

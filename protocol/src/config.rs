@@ -175,7 +175,8 @@ impl Default for EstimateConfig {
 pub struct GossipConfig {
     /// Longest time between two announcements of the root hash. They come this rarely only while nothing changes.
     pub have_secs: f64,
-    /// Time between two pose beacons.
+    /// Shortest time between two pose beacons: each tells of a keyframe at once. One that tells nothing new, of a robot that
+    /// stands, waits 2.5 times as long.
     pub pose_secs: f64,
     /// Bytes of entries in one sync answer at most.
     pub delta_bytes_max: usize,

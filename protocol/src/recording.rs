@@ -9,6 +9,9 @@
 //! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, m, one per keyframe.
 //! - `places.f32` (if the manifest has `[places]`): what the user's own place recognition says of each keyframe, a row of
 //!   little-endian f32 each, as `numpy.ndarray.tofile` writes them; a row of NaN where there is nothing to say.
+//! - `positions.csv` (optional): a header line ([`POSITIONS_HEADER`]), then with stamps that do not fall where other robots
+//!   were seen: `stamp_ns,robot,x,y,z,c00,c01,c02,c11,c12,c22` (the body's origin in the observer's body frame, m, and the
+//!   upper triangle of its covariance). Only robots whose recordings state `begins_ns` can be played so that they meet.
 //! - the clouds that the keyframes name, relative to the folder, points in the body frame.
 //!
 //! A data set for several robots is a folder whose sub-folders are recordings.
@@ -23,6 +26,8 @@ pub const FORMAT: &str = "merganser-recording";
 pub const KEYFRAMES_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,c02,c03,c04,c05,c11,c12,c13,c14,c15,c22,c23,c24,c25,c33,c34,c35,c44,c45,c55,cloud";
 /// First line of `truth.csv`.
 pub const TRUTH_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw";
+/// First line of `positions.csv`.
+pub const POSITIONS_HEADER: &str = "stamp_ns,robot,x,y,z,c00,c01,c02,c11,c12,c22";
 /// Units that a recording may be in, m.
 pub const UNIT_RANGE_M: core::ops::RangeInclusive<f64> = 1e-3..=1e3;
 /// Keyframes in one recording at most.
@@ -54,6 +59,9 @@ pub struct Manifest {
     /// is judged by it; no agent is told. In [`UNIT_RANGE_M`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit_m: Option<f64>,
+    /// What this robot's clock showed when all recordings of the data set began; without it, when its first keyframe came.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub begins_ns: Option<i64>,
     /// What the rows of `places.f32` are, if there is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub places: Option<PlaceFormat>,

@@ -200,14 +200,15 @@ pub struct GraphView {
     pub dof: u64,
     /// Whether the optimum is proved to be the global one; applies where every measurement's weight is isotropic.
     pub optimality: Optimality,
-    /// Alignments and sightings, used or not (odometry edges are implied by the submaps).
+    /// Alignments, sightings and positions, used or not (odometry edges are implied by the submaps).
     pub edges: Vec<EdgeView>,
 }
 
-/// One alignment or sighting.
+/// One alignment, sighting or position.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EdgeView {
-    /// `alignment` or `sighting`.
+    /// `alignment`, `sighting`, or `position`: a sighting that does not tell how the other robot is turned. Its
+    /// `t_i_j` is turned as the map says, and as uncertain in that as if nothing were known.
     pub kind: String,
     /// Target submap, `name/epoch#index`.
     pub i: String,

@@ -159,6 +159,7 @@ fn manifest(
         keyframes,
         origin: origin.to_owned(),
         unit_m: unit_is_unknown.then_some(unit_m),
+        begins_ns: None,
         places: None,
         config,
     })

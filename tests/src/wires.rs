@@ -49,16 +49,26 @@ pub fn play_with(
     mut meddle: impl FnMut(&mut Wires, usize),
 ) -> Result<Wires, String> {
     let mut wires = Wires::new(recordings, seed)?;
-    let mut order: Vec<(i64, usize, usize)> = Vec::new();
+    let mut order: Vec<(i64, usize, bool, usize)> = Vec::new();
     for (robot, recording) in recordings.iter().enumerate() {
-        let first = recording.keyframes().first().map_or(0, |line| line.stamp.0);
-        order
-            .extend(recording.keyframes().iter().enumerate().map(|(index, line)| (line.stamp.0 - first, robot, index)));
+        let begins = recording.begins().0;
+        let keyframes = recording.keyframes().iter().map(|line| line.stamp.0).enumerate();
+        order.extend(keyframes.map(|(index, stamp)| (stamp - begins, robot, false, index)));
+        let positions = recording.positions().iter().map(|seen| seen.stamp.0).enumerate();
+        order.extend(positions.map(|(index, stamp)| ((stamp - begins).max(0), robot, true, index)));
     }
     order.sort_unstable();
-    for (count, (nanos, robot, index)) in order.into_iter().enumerate() {
+    let mut count = 0;
+    for (nanos, robot, is_position, index) in order {
+        let at = Instant::ZERO.after(Duration::from_nanos(nanos.unsigned_abs()));
+        if is_position {
+            wires.run_to(at);
+            wires.input(robot, Input::Position(recordings[robot].positions()[index].clone()));
+            continue;
+        }
         meddle(&mut wires, count);
-        wires.run_to(Instant::ZERO.after(Duration::from_nanos(nanos.unsigned_abs())));
+        count += 1;
+        wires.run_to(at);
         let keyframe = recordings[robot].keyframe(index).map_err(|error| error.to_string())?;
         wires.input(robot, Input::Keyframe(keyframe));
     }

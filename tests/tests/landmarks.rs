@@ -151,6 +151,28 @@ fn five_robots_agree_with_the_survey() {
         count(&|e| wrong(e) && e.weight > 0.0)
     );
 
+    let positions: Vec<&EdgeView> = graph.edges.iter().filter(|edge| edge.kind == "position").collect();
+    let given: usize = recordings.iter().map(|recording| recording.positions().len()).sum();
+    let off: Vec<f64> = positions
+        .iter()
+        .filter_map(|edge| {
+            let t_i_j = relation(&edge.t_i_j)?;
+            Some(
+                t_i_j.covariance.mahalanobis_squared(&t_i_j.pose.local(&(truth(&edge.i)?.inverse() * truth(&edge.j)?))),
+            )
+        })
+        .collect();
+    let used = positions.iter().filter(|edge| edge.weight > 0.0).count();
+    println!(
+        "{given} sightings of robots, {} stated, {used} used; NEES of {} by the survey {:.2} of 3",
+        positions.len(),
+        off.len(),
+        off.iter().sum::<f64>() / off.len() as f64
+    );
+    for edge in positions.iter().filter(|edge| edge.weight == 0.0) {
+        println!("  {} {}: {}", edge.i, edge.j, edge.reason);
+    }
+
     // Every landmark in the joint frame: what all submaps say of it, by their certainty.
     let mut sums: BTreeMap<u32, (Matrix3<f64>, Vector3<f64>)> = BTreeMap::new();
     let mut joined = 0;
@@ -187,6 +209,8 @@ fn five_robots_agree_with_the_survey() {
     assert_eq!(status.merged_with.len(), names.len() - 1, "the five are not in one frame");
     assert_eq!((joined, exchanged.len()), (map.submaps.len(), 15));
     assert!(!alignments().any(|edge| edge.weight > 0.0 && wrong(edge)), "a false alignment is used");
+    assert!(positions.len() > 100 && used * 20 >= positions.len() * 19, "what robots saw of one another does not fit");
+    assert!(off.iter().sum::<f64>() < 3.0 * off.len() as f64, "sightings are off by more than they say");
     assert!(rms(&exchanged) <= RMS_MAX, "{:.3} m", rms(&exchanged));
     assert!(rms(&printed) > 0.5, "as printed two landmarks cannot fit");
 }

@@ -187,8 +187,15 @@ async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recording>, speed
     }
 }
 
-/// Feeds a recording in its own time, `speed` times faster, and closes the last submap.
+/// Feeds a recording in its own time, `speed` times faster, and closes the last submap. Where other robots were seen says
+/// something only in real time: how old their beacons are, nobody can tell whose time runs otherwise.
 async fn play(inbox: &Inbox, recording: Recording, speed: f64) -> Result<()> {
+    let begins = recording.begins();
+    let positions = if speed == 1.0 { recording.positions().to_vec() } else { Vec::new() };
+    if positions.len() < recording.positions().len() {
+        info!(count = recording.positions().len(), "sightings of other robots are left out; they need --speed 1");
+    }
+    let mut positions = positions.into_iter().peekable();
     let (sender, mut keyframes) = mpsc::channel(READ_AHEAD);
     let reader = tokio::task::spawn_blocking(move || {
         for index in 0..recording.len() {
@@ -197,13 +204,16 @@ async fn play(inbox: &Inbox, recording: Recording, speed: f64) -> Result<()> {
             }
         }
     });
-    let mut origin: Option<(tokio::time::Instant, Stamp)> = None;
+    let start = tokio::time::Instant::now();
+    let due = |stamp: Stamp| start + Duration::try_from_secs_f64(stamp.secs_since(begins) / speed).unwrap_or_default();
     let mut fed = 0_u64;
     while let Some(keyframe) = keyframes.recv().await {
         let keyframe = keyframe.context("the recording ends here")?;
-        let (start, first) = *origin.get_or_insert((tokio::time::Instant::now(), keyframe.stamp));
-        let ahead = keyframe.stamp.secs_since(first) / speed;
-        tokio::time::sleep_until(start + Duration::try_from_secs_f64(ahead).unwrap_or_default()).await;
+        while let Some(seen) = positions.next_if(|seen| seen.stamp < keyframe.stamp) {
+            tokio::time::sleep_until(due(seen.stamp)).await;
+            inbox.feed(Input::Position(seen)).await;
+        }
+        tokio::time::sleep_until(due(keyframe.stamp)).await;
         if !inbox.feed(Input::Keyframe(keyframe)).await {
             return Ok(());
         }

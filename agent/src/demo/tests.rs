@@ -361,6 +361,7 @@ pub(super) fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             keyframes: 0,
             origin: "a test".into(),
             unit_m: track.unit_m.filter(|_| unknown),
+            begins_ns: None,
             places: None,
             config,
         };

@@ -90,7 +90,8 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
     let bytes = sample.payload().to_bytes();
     let parsed = match input {
         "keyframe" => observation::keyframe(format, &bytes).map(Input::Keyframe),
-        _ => observation::sighting(format, &bytes).map(Input::Sighting),
+        "sighting" => observation::sighting(format, &bytes).map(Input::Sighting),
+        _ => observation::position(format, &bytes).map(Input::Position),
     };
     match parsed {
         Ok(observed) => {

@@ -49,6 +49,16 @@ pub enum Problem {
     /// `unit_m` can be none.
     #[error("unit_m = {0}: state what one is in this recording, 0.001 to 1000 m, or leave it out")]
     UnitRange(f64),
+    /// The first keyframe does not come soon after the beginning.
+    #[error(
+        "begins_ns = {begins}: the first keyframe, at {first} ns, must come up to a day later; state both on one clock"
+    )]
+    Begins {
+        /// As stated, ns.
+        begins: i64,
+        /// Stamp of the first keyframe, ns.
+        first: i64,
+    },
     /// `[places]` describes no vectors.
     #[error("places.numbers: {0}")]
     Place(PlaceError),

@@ -198,6 +198,7 @@ impl Cut<'_> {
             keyframes: 0,
             origin: format!("{}; laid on the true motion: {} (1 σ, seed {})", self.origin, self.drift, self.seed),
             unit_m: None,
+            begins_ns: None,
             places: None,
             config: self.config.clone(),
         })

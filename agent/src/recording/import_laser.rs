@@ -63,6 +63,7 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
             clouds: CloudFormat::Ply,
             keyframes: 0,
             unit_m: None,
+            begins_ns: None,
             places: None,
             origin: format!(
                 "CARMEN log of {} scans, real odometry; every third scan from {from} to {to} (counted from 0)",

@@ -1,15 +1,16 @@
 //! An MRCLAM data set becomes its robots: `RobotN_Odometry.dat` and `RobotN_Measurement.dat` of each, `Barcodes.dat` of all
 //! (each may be packed, `.xz`). A filter stands in for each robot's own SLAM (`merganser_protocol::mrclam`); landmarks are
-//! handed over under their bar codes, what was seen of other robots is left out.
+//! handed over under their bar codes, and where other robots were seen.
 
 use super::Writer;
 use super::cloud::read_bytes;
 use super::error::{Problem, RecordingError, on};
+use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::ids::Name;
-use merganser_protocol::mrclam::{MrclamError, keyframes, sightings, speeds, subjects};
+use merganser_protocol::mrclam::{MrclamError, keyframes, position, sightings, speeds, subjects};
 use merganser_protocol::recording::{CloudFormat, FORMAT, Manifest, VERSION};
-use merganser_protocol::submap::CovarianceOf;
+use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -42,6 +43,7 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
     // Never by rotation: a submap that saw all around has more landmarks in common with others.
     config.submap.rotation_deg = 360.0;
     config.submap.keyframes_max = 32;
+    let mut made = Vec::new();
     for robot in &robots {
         let speeds = read(data, &format!("Robot{robot}_Odometry.dat"), speeds)?;
         let (measured, file) = (format!("Robot{robot}_Measurement.dat"), data.join(BARCODES));
@@ -54,21 +56,28 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
                 return Err(Problem::Data(why).of(file));
             }
         }
+        let met: Vec<PositionSighting> = seen
+            .iter()
+            .filter_map(|s| {
+                subjects.get(&s.barcode).filter(|seen| robots.contains(seen) && *seen != robot).map(|who| (s, who))
+            })
+            .map(|(s, who)| Ok(position(s, name(*who, out)?)))
+            .collect::<Result<_, RecordingError>>()?;
         seen.retain(|s| subjects.get(&s.barcode).is_some_and(|subject| !robots.contains(subject)));
         let keyframes = keyframes(&speeds, &seen);
-        let folder = out.join(format!("robot{robot}"));
-        // What an earlier run left must not pass for part of this one.
-        if folder.exists() {
-            on(&folder, std::fs::remove_dir_all(&folder))?;
-        }
         if keyframes.is_empty() {
             let why = "no landmark is seen while the odometry runs; are both files of one robot and one run?";
             return Err(Problem::Data(why.into()).of(data.join(measured)));
         }
+        made.push((name(*robot, out)?, keyframes, met));
+    }
+    // All logs of a run are on one clock.
+    let begins = made.iter().filter_map(|(_, keyframes, _)| keyframes.first()).map(|first| first.stamp).min();
+    made.into_iter().try_for_each(|(robot, keyframes, met)| {
         let manifest = Manifest {
             format: FORMAT.into(),
             version: VERSION,
-            robot: Name::new(format!("robot{robot}")).map_err(|e| Problem::Data(e.to_string()).of(&folder))?,
+            robot,
             sensor: "landmarks2d".into(),
             covariance_of: CovarianceOf::Motion,
             clouds: CloudFormat::Ply,
@@ -76,14 +85,33 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
             origin: "MRCLAM logs, whole; every other sighting of a landmark corrects the odometry, the others are handed over"
                 .into(),
             unit_m: None,
+            begins_ns: begins.map(|stamp| stamp.0),
             places: None,
             config: config.clone(),
         };
-        let mut writer = Writer::create(&folder, manifest)?;
-        keyframes.iter().try_for_each(|keyframe| writer.push(keyframe, None))?;
-        writer.finish()?;
+        write(out, manifest, &keyframes, &met)
+    })
+}
+
+fn name(robot: u32, out: &Path) -> Result<Name, RecordingError> {
+    Name::new(format!("robot{robot}")).map_err(|e| Problem::Data(e.to_string()).of(out))
+}
+
+fn write(
+    out: &Path,
+    manifest: Manifest,
+    keyframes: &[Keyframe],
+    met: &[PositionSighting],
+) -> Result<(), RecordingError> {
+    let folder = out.join(manifest.robot.as_str());
+    // What an earlier run left must not pass for part of this one.
+    if folder.exists() {
+        on(&folder, std::fs::remove_dir_all(&folder))?;
     }
-    Ok(())
+    let mut writer = Writer::create(&folder, manifest)?;
+    keyframes.iter().try_for_each(|keyframe| writer.push(keyframe, None))?;
+    met.iter().for_each(|seen| writer.push_position(seen));
+    writer.finish()
 }
 
 /// Reads one file, packed or not.
@@ -150,6 +178,12 @@ mod tests {
         let keyframe = recordings[0].keyframe(5).unwrap();
         assert!(!keyframe.marks.is_empty() && keyframe.marks.len() == keyframe.points.len());
         assert!(keyframe.marks.iter().all(|mark| matches!(mark.label, Some(72 | 27))), "landmarks only, no robots");
+        // The first sees the second, 3 m ahead and a little to the left; the second sees its own code, which is misread.
+        let [met, none] = [0, 1].map(|k| recordings[k].positions());
+        assert_eq!((met.len(), none.len()), (100, 0));
+        assert!(met.iter().all(|seen| seen.robot.as_str() == "robot2"));
+        assert!((met[7].position[0] - 3.0 * 0.1f64.cos()).abs() < 1e-9 && (met[7].position[1] - 0.3).abs() < 1e-2);
+        assert_eq!(recordings[0].begins(), recordings[1].keyframes()[0].stamp.min(recordings[0].keyframes()[0].stamp));
     }
 
     #[test]

@@ -25,8 +25,10 @@ pub use table::{KeyframeLine, TruthLine};
 pub use write::Writer;
 
 use error::on;
+use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, Manifest, UNIT_RANGE_M, VERSION};
 use merganser_protocol::submap::Keyframe;
+use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::ScaleKind;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -37,8 +39,12 @@ pub const MANIFEST: &str = "recording.toml";
 pub const KEYFRAMES: &str = "keyframes.csv";
 /// Name of the table of true poses.
 pub const TRUTH: &str = "truth.csv";
+/// Name of the table of where other robots were seen.
+pub const POSITIONS: &str = "positions.csv";
 /// Name of the file of place descriptors.
 pub const PLACES: &str = "places.f32";
+/// Time from the beginning of a data set to a robot's first keyframe, s, at most.
+const BEGINS_SECS_MAX: f64 = 86_400.0;
 /// Bytes of a manifest at most.
 const MANIFEST_BYTES_MAX: u64 = 1 << 20;
 
@@ -49,6 +55,7 @@ pub struct Recording {
     manifest: Manifest,
     keyframes: Vec<KeyframeLine>,
     truth: Option<Vec<TruthLine>>,
+    positions: Vec<PositionSighting>,
 }
 
 impl Recording {
@@ -73,7 +80,15 @@ impl Recording {
         }
         let truth = folder.join(TRUTH);
         let truth = if truth.exists() { Some(read_truth(&truth, &keyframes)?) } else { None };
-        Ok(Self { folder: folder.into(), manifest, keyframes, truth })
+        if let (Some(begins), Some(first)) = (manifest.begins_ns, keyframes.first())
+            && !(0.0..=BEGINS_SECS_MAX).contains(&first.stamp.secs_since(Stamp(begins)))
+        {
+            let problem = Problem::Begins { begins, first: first.stamp.0 };
+            return Err(problem.of(folder.join(MANIFEST)));
+        }
+        let positions = folder.join(POSITIONS);
+        let positions = if positions.exists() { table::read_positions(&positions)? } else { Vec::new() };
+        Ok(Self { folder: folder.into(), manifest, keyframes, truth, positions })
     }
 
     /// Reads every cloud once, to find a bad one before any use.
@@ -102,6 +117,17 @@ impl Recording {
     /// `t_world_body` at each keyframe, if the recording has it.
     pub fn truth(&self) -> Option<&[TruthLine]> {
         self.truth.as_deref()
+    }
+
+    /// Where other robots were seen, in the order of the stamps.
+    pub fn positions(&self) -> &[PositionSighting] {
+        &self.positions
+    }
+
+    /// What the robot's clock showed when the recording began.
+    pub fn begins(&self) -> Stamp {
+        let first = self.keyframes.first().map_or(Stamp(0), |first| first.stamp);
+        self.manifest.begins_ns.map_or(first, Stamp)
     }
 
     /// Number of keyframes, at least 1.

@@ -101,6 +101,7 @@ mod tests {
             keyframes: 0,
             origin: String::new(),
             unit_m: None,
+            begins_ns: None,
             places: None,
             config: merganser_protocol::config::Config::default(),
         };

@@ -2,9 +2,11 @@
 //! refuses the recording; nothing is guessed or skipped.
 
 use super::error::{Problem, RecordingError, on};
-use crate::observation::COORDINATE_MAX;
+use crate::observation::{COORDINATE_MAX, PositionMessage};
+use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
-use merganser_protocol::recording::{KEYFRAMES_HEADER, KEYFRAMES_MAX, TRUTH_HEADER};
+use merganser_protocol::ids::Name;
+use merganser_protocol::recording::{KEYFRAMES_HEADER, KEYFRAMES_MAX, POSITIONS_HEADER, TRUTH_HEADER};
 use merganser_protocol::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
 use std::fs::File;
@@ -64,6 +66,27 @@ pub(super) fn read_truth(path: &Path) -> Result<Vec<TruthLine>, RecordingError> 
     let mut lines = Vec::new();
     read(path, TRUTH_HEADER, |fields| {
         lines.push(TruthLine { stamp: stamp(fields[0])?, pose: pose(&fields[1..8])? });
+        Ok(())
+    })?;
+    Ok(lines)
+}
+
+/// Reads `positions.csv`; stamps are seen not to fall.
+pub(super) fn read_positions(path: &Path) -> Result<Vec<PositionSighting>, RecordingError> {
+    let mut lines: Vec<PositionSighting> = Vec::new();
+    read(path, POSITIONS_HEADER, |fields| {
+        let mut values = [0.0; 9];
+        for ((value, text), column) in values.iter_mut().zip(&fields[2..]).zip(POSITIONS_HEADER.split(',').skip(2)) {
+            *value = number(column, text)?;
+        }
+        let [x, y, z, covariance @ ..] = values;
+        let robot = Name::new(fields[1]).map_err(|error| Problem::Data(error.to_string()))?;
+        let message = PositionMessage { stamp_ns: stamp(fields[0])?.0, robot, position: [x, y, z], covariance };
+        let line = PositionSighting::try_from(message).map_err(|error| Problem::Data(error.to_string()))?;
+        if let Some(previous) = lines.last().map(|line| line.stamp).filter(|previous| *previous > line.stamp) {
+            return Err(Problem::Unsorted { stamp: line.stamp.0, previous: previous.0 });
+        }
+        lines.push(line);
         Ok(())
     })?;
     Ok(lines)

@@ -22,6 +22,7 @@ fn write_good(folder: &Path, robot: &str) {
         keyframes: 0,
         origin: "a test".into(),
         unit_m: None,
+        begins_ns: Some(900),
         places: None,
         config: Config::default(),
     };
@@ -42,6 +43,11 @@ fn write_good(folder: &Path, robot: &str) {
             place: None,
         };
         writer.push(&keyframe, Some(&pose.pose.inverse())).unwrap();
+    }
+    for stamp in [990, 1002, 1002] {
+        let (robot, position) = (Name::new("beta").unwrap(), [1.5, -0.25, stamp as f64 * 1e-3]);
+        let covariance = [0.01, 1e-3, 0.0, 0.02, 0.0, 1.0];
+        writer.push_position(&PositionSighting { stamp: Stamp(stamp), robot, position, covariance });
     }
     writer.finish().unwrap();
 }
@@ -101,6 +107,26 @@ fn a_written_recording_reads_back_to_the_bit() {
     assert_eq!(third.covariance_of, CovarianceOf::Pose);
     assert_eq!(recording.truth().unwrap()[3].stamp, Stamp(1003));
     assert!(recording.keyframe(4).is_err());
+    assert_eq!(recording.begins(), Stamp(900));
+    let seen: Vec<(i64, &str, f64)> =
+        recording.positions().iter().map(|p| (p.stamp.0, p.robot.as_str(), p.position[2])).collect();
+    assert_eq!(seen, [(990, "beta", 0.99), (1002, "beta", 1.002), (1002, "beta", 1.002)]);
+    assert_eq!(recording.positions()[0].covariance, [0.01, 1e-3, 0.0, 0.02, 0.0, 1.0]);
+}
+
+#[test]
+fn bad_positions_are_told() {
+    let field = |column, value: &'static str| refused(move |d| set_field(&d.join(POSITIONS), 2, column, value));
+    expect(&field(0, "1.5"), POSITIONS, Some(3), "stamp_ns = \"1.5\"");
+    expect(&field(0, "7"), POSITIONS, Some(3), "stamp 7 does not come after 990");
+    expect(&field(1, "Beta!"), POSITIONS, Some(3), "\"Beta!\" is not a name");
+    expect(&field(2, "NaN"), POSITIONS, Some(3), "x is NaN");
+    expect(&field(4, "1e9"), POSITIONS, Some(3), "position");
+    expect(&field(10, "-1"), POSITIONS, Some(3), "covariance");
+    expect(&refused(|d| edit(&d.join(POSITIONS), "robot,x", "who,x")), POSITIONS, Some(1), "the first line must be");
+    let begins = |value: &'static str| refused(move |d| edit(&d.join(MANIFEST), "begins_ns = 900", value));
+    expect(&begins("begins_ns = 1001"), MANIFEST, None, "begins_ns = 1001");
+    expect(&begins("begins_ns = -86400000000000"), MANIFEST, None, "up to a day");
 }
 
 #[test]
@@ -129,7 +155,7 @@ fn bad_manifests_are_told() {
     expect(&with("robot = \"alpha\"", "robot = \"Alpha\""), MANIFEST, Some(3), "\"Alpha\" is not a name");
     expect(&with("keyframes = 4", "keyframes = 0"), MANIFEST, None, "holds 1 to 1000000");
     expect(&with("voxel_m = 0.1", "voxel_m = -1.0"), MANIFEST, None, "config.submap.voxel_m");
-    expect(&with("voxel_m = 0.1", "voxel = 0.1"), MANIFEST, Some(12), "voxel");
+    expect(&with("voxel_m = 0.1", "voxel = 0.1"), MANIFEST, Some(13), "voxel");
     expect(&with("format = ", "format == "), MANIFEST, Some(1), "");
     expect(
         &with("origin = ", "unit_m = 0.5\norigin = "),

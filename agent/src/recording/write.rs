@@ -5,9 +5,10 @@ use super::cloud;
 use super::error::{Problem, RecordingError, on};
 use super::landmarks;
 use super::places::Rows;
-use super::{KEYFRAMES, MANIFEST, PLACES, TRUTH};
+use super::{KEYFRAMES, MANIFEST, PLACES, POSITIONS, TRUTH};
+use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::geometry::Se3;
-use merganser_protocol::recording::{FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION};
+use merganser_protocol::recording::{FORMAT, KEYFRAMES_HEADER, Manifest, POSITIONS_HEADER, TRUTH_HEADER, VERSION};
 use merganser_protocol::submap::Keyframe;
 use std::fmt::Write as _;
 use std::fs;
@@ -24,6 +25,7 @@ pub struct Writer {
     keyframes: String,
     truth: String,
     places: Rows,
+    positions: String,
 }
 
 impl Writer {
@@ -36,7 +38,8 @@ impl Writer {
         on(folder, fs::create_dir_all(folder.join(CLOUDS)))?;
         let manifest = Manifest { format: FORMAT.into(), version: VERSION, keyframes: 0, ..manifest };
         let (keyframes, truth) = (format!("{KEYFRAMES_HEADER}\n"), format!("{TRUTH_HEADER}\n"));
-        Ok(Self { folder: folder.into(), manifest, keyframes, truth, places: Rows::default() })
+        let positions = format!("{POSITIONS_HEADER}\n");
+        Ok(Self { folder: folder.into(), manifest, keyframes, truth, places: Rows::default(), positions })
     }
 
     /// Adds a keyframe, with `t_world_body` where it is known: for all keyframes or for none.
@@ -70,6 +73,15 @@ impl Writer {
         Ok(())
     }
 
+    /// Adds where another robot was seen; stamps do not fall.
+    pub fn push_position(&mut self, seen: &PositionSighting) {
+        let _ = write!(self.positions, "{},{}", seen.stamp.0, seen.robot);
+        for value in seen.position.iter().chain(&seen.covariance) {
+            let _ = write!(self.positions, ",{value}");
+        }
+        self.positions.push('\n');
+    }
+
     /// Writes the tables and the manifest.
     ///
     /// # Errors
@@ -83,6 +95,9 @@ impl Writer {
         if let Some((format, rows)) = self.places.finish() {
             write(PLACES, rows)?;
             self.manifest.places = Some(format);
+        }
+        if self.positions.lines().count() > 1 {
+            write(POSITIONS, self.positions.as_bytes())?;
         }
         let truths = self.truth.lines().count() - 1;
         if truths != 0 {

@@ -36,7 +36,7 @@ impl Agent {
                     self.on_fact(EntryId { seq: one.seq, ..id }, &one.fact);
                 }
             }
-            Fact::Sighting(_) => {}
+            Fact::Sighting(_) | Fact::Position(_) => {}
         }
     }
 

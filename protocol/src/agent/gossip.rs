@@ -3,15 +3,15 @@
 //! them. Pose beacons are hints: best effort, latest wins, never facts.
 
 use super::Agent;
+use super::beacons::SeenBeacon;
 use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
 use super::knowledge::{Pair, pair_of};
 use super::ledger::BATCHES_WAITING_MAX;
-use super::sighting::Twist;
 use super::traffic::{Traffic, is_piece};
 use crate::config::GossipConfig;
 use crate::gossip::{Answer, Class, Spread, Step};
 use crate::ids::{Hash, RobotId, SubmapId};
-use crate::time::Instant;
+use crate::time::{Instant, Stamp};
 use crate::wire::limits::BLOB_PIECE_LEN;
 use crate::wire::messages::{AlignStatus, Message};
 use crate::wire::{Beacon, BeaconContent};
@@ -20,6 +20,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Raw blobs kept in memory to serve others.
 pub const BLOBS_MAX: usize = 2_048;
+/// A beacon that tells nothing new waits so many times `gossip.pose_secs`.
+const REPEAT_PAUSES: f64 = 2.5;
 /// Shortest time between two wishes ([`Message::AlignRequest`]).
 const WISH_EVERY: Duration = Duration::from_secs(2);
 
@@ -30,37 +32,11 @@ pub(super) struct Gossip {
     beacons: BTreeMap<RobotId, SeenBeacon>,
     blobs: BTreeMap<Hash, Vec<u8>>,
     questions: BTreeMap<QueryId, Question>,
-    next_pose: Instant,
+    /// When the last beacon of ours went out, and the keyframe that it told of.
+    posed: (Instant, Option<Stamp>),
     next_piece: Instant,
     next_wish: Instant,
     beacon_counter: u64,
-}
-
-/// The latest beacon of a robot.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct SeenBeacon {
-    pub(super) content: BeaconContent,
-    pub(super) at: Instant,
-    /// When the first one with this stamp was heard: the robot may have moved since, and had no keyframe.
-    pub(super) since: Instant,
-    /// How the body moves, as far as this one and those before it tell.
-    pub(super) twist: Option<Twist>,
-}
-
-impl SeenBeacon {
-    fn after(before: Option<&Self>, content: BeaconContent, at: Instant) -> Self {
-        let Some(Self { content: old, since, twist, .. }) = before else {
-            return Self { content, at, since: at, twist: None };
-        };
-        if old.anchor.frame != content.anchor.frame {
-            return Self { content, at, since: at, twist: None };
-        }
-        // A body is told relative to its anchor, and what lies between two anchors is not asked here.
-        let secs = content.stamp.secs_since(old.stamp);
-        let told = Twist::between(&old.t_anchor_body.pose, &content.t_anchor_body.pose, secs);
-        let twist = told.filter(|_| old.anchor == content.anchor).or(*twist);
-        Self { content, at, since: if content.stamp == old.stamp { *since } else { at }, twist }
-    }
 }
 
 /// A question of ours under way.
@@ -87,7 +63,7 @@ impl Gossip {
             beacons: BTreeMap::new(),
             blobs: BTreeMap::new(),
             questions: BTreeMap::new(),
-            next_pose: now,
+            posed: (now, None),
             next_piece: now,
             next_wish: now,
             beacon_counter: 0,
@@ -134,17 +110,17 @@ impl Gossip {
 
 impl Agent {
     pub(super) fn gossip_timeout(&self) -> Option<Instant> {
-        let Gossip { spread, traffic, next_pose, .. } = &self.gossip;
+        let Gossip { spread, traffic, .. } = &self.gossip;
         let speak = spread.timeout().max(traffic.due(self.now, Class::Have));
-        [Some(speak), Some(*next_pose), traffic.timeout(self.now)].into_iter().flatten().min()
+        [Some(speak), Some(self.pose_due()), traffic.timeout(self.now)].into_iter().flatten().min()
     }
 
     pub(super) fn run_timers(&mut self) {
         self.expire_questions();
         self.publish_unsent();
         self.spread();
-        if self.now >= self.gossip.next_pose {
-            self.gossip.next_pose = self.now.after(Duration::from_secs_f64(self.config.gossip.pose_secs));
+        if self.now >= self.pose_due() {
+            self.gossip.posed = (self.now, self.stamp());
             self.publish_pose();
         }
         if self.now >= self.gossip.next_wish {
@@ -169,6 +145,19 @@ impl Agent {
         if self.gossip.spread.timeout() <= self.now {
             self.may_speak();
         }
+    }
+
+    /// A keyframe is told of at once, if the last beacon went out `pose_secs` ago: late news would be taken for a place where
+    /// we no longer are. Without a new one the beacon is repeated, less often, for who missed it.
+    fn pose_due(&self) -> Instant {
+        let (at, told) = self.gossip.posed;
+        let pauses = if self.stamp() == told { REPEAT_PAUSES } else { 1.0 };
+        at.after(Duration::from_secs_f64(pauses * self.config.gossip.pose_secs))
+    }
+
+    /// Of our last keyframe, once there is a beacon to send of it.
+    fn stamp(&self) -> Option<Stamp> {
+        self.mapper.body().map(|(_, _, stamp)| stamp)
     }
 
     fn publish_pose(&mut self) {

@@ -49,6 +49,8 @@ pub enum Input {
     Keyframe(Keyframe),
     /// The robot's own sensors measured another robot directly.
     Sighting(Sighting),
+    /// Another robot was seen, but not how it is turned.
+    Position(PositionSighting),
     /// A broadcast arrived. `from` is the robot the key names (a hint for statistics, not proof).
     Received {
         /// Whose key it came on.
@@ -118,6 +120,19 @@ pub struct Sighting {
     pub t_body_other: [f64; 7],
     /// Row-major upper triangle of the 6×6 covariance of the local perturbation (ρ, φ).
     pub covariance: [f64; 21],
+}
+
+/// A direct measurement of where another robot's body is: a range and a bearing. How it is turned was not seen.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PositionSighting {
+    /// When.
+    pub stamp: Stamp,
+    /// Who was seen.
+    pub robot: Name,
+    /// `p_body_other`: its body's origin in ours, m.
+    pub position: [f64; 3],
+    /// Row-major upper triangle of the 3×3 covariance along our body's axes, m².
+    pub covariance: [f64; 6],
 }
 
 /// What an operator or a shell can ask for.

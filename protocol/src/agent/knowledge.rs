@@ -4,13 +4,16 @@
 use super::two_sided;
 use crate::estimate::distortion::{COMMON_BENT, COMMON_LIDAR};
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
+use crate::estimate::position::{SeenPoint, StatedPoint};
 use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::Summary;
 use crate::time::Stamp;
 use crate::wire::fact::{
-    AlignmentFact, CarriedFact, Fact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
+    AlignmentFact, CarriedFact, Fact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact,
+    VerdictOutcome,
 };
+use nalgebra::Vector3;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A pair of submaps, the smaller first.
@@ -80,6 +83,7 @@ pub struct Knowledge {
     by_pair: BTreeMap<Pair, BTreeSet<EntryId>>,
     verdicts: BTreeMap<EntryId, BTreeMap<EntryId, VerdictFact>>,
     sightings: BTreeMap<EntryId, SightingFact>,
+    positions: BTreeMap<EntryId, PositionFact>,
     /// Derived, kept because it is asked often: what [`Knowledge::judge`] says of each alignment.
     agreements: BTreeMap<EntryId, Agreement>,
 }
@@ -107,9 +111,13 @@ impl Knowledge {
                 self.agreements.insert(alignment, self.judge(alignment));
             }
             Fact::Sighting(sighting) => {
-                let known = sighting.i.frame.robot == id.frame.robot && sighting.j.frame.robot != id.frame.robot;
-                if known {
+                if is_of_another(id, sighting.i, sighting.j) {
                     self.sightings.insert(id, sighting);
+                }
+            }
+            Fact::Position(position) => {
+                if is_of_another(id, position.i, position.j) {
+                    self.positions.insert(id, position);
                 }
             }
         }
@@ -120,6 +128,7 @@ impl Knowledge {
         let gone = |id: &EntryId| id.frame == frame && id.seq < floor;
         self.submaps.retain(|_, known| !gone(&known.entry));
         self.sightings.retain(|id, _| !gone(id));
+        self.positions.retain(|id, _| !gone(id));
         let entries = EntryId { frame, seq: 0 }..EntryId { frame, seq: floor };
         let alignments: Vec<EntryId> = self.alignments.range(entries).map(|(id, _)| *id).collect();
         for id in alignments {
@@ -258,6 +267,11 @@ impl Knowledge {
         let tie = |entry: EntryId, i: SubmapId, j: SubmapId, t_i_j: Relative| {
             Some(AgreedAlignment { entry, i: place(i)?, j: place(j)?, t_i_j })
         };
+        let point = |(entry, fact): (&EntryId, &PositionFact)| {
+            let [p_i, p_j] = [fact.p_i, fact.p_j].map(|p| Vector3::from(p.map(f64::from)));
+            let point = SeenPoint { p_i, p_j, covariance: fact.covariance };
+            Some(StatedPoint { entry: *entry, i: place(fact.i)?, j: place(fact.j)?, point })
+        };
         let agreed: Vec<(AgreedAlignment, f64)> = self
             .by_pair
             .iter()
@@ -274,8 +288,10 @@ impl Knowledge {
         let sightings = self.sightings.iter();
         let sightings: Vec<AgreedAlignment> =
             sightings.filter_map(|(entry, fact)| tie(*entry, fact.i, fact.j, Relative::Metric(fact.t_i_j))).collect();
-        let ties = alignments.iter().chain(&sightings);
-        let tied: BTreeSet<FrameId> = ties.flat_map(|tie| [tie.i.frame, tie.j.frame]).chain([own]).collect();
+        let positions: Vec<StatedPoint> = self.positions.iter().filter_map(point).collect();
+        let ties = alignments.iter().chain(&sightings).flat_map(|tie| [tie.i.frame, tie.j.frame]);
+        let seen = positions.iter().flat_map(|stated| [stated.i.frame, stated.j.frame]);
+        let tied: BTreeSet<FrameId> = ties.chain(seen).chain([own]).collect();
         let mut chain = |frame: &FrameId| {
             let known = |index: &u32| self.submap(SubmapId { frame: *frame, index: *index });
             let mut anchors = chains.get(frame)?.iter().filter_map(known).peekable();
@@ -288,7 +304,7 @@ impl Knowledge {
         let gaps =
             posed.into_iter().filter(|(_, chain)| chain.last().is_some_and(|last| *last as usize >= chain.len()));
         Question {
-            problem: MapProblem { frames, alignments, sightings, common, ambiguous: self.ambiguous() },
+            problem: MapProblem { frames, alignments, sightings, positions, common, ambiguous: self.ambiguous() },
             alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
             gaps: gaps.collect(),
         }
@@ -317,10 +333,11 @@ impl Knowledge {
         self.submap(id).and_then(|known| known.summary.as_ref()).is_some_and(Summary::is_of_ranges)
     }
 
-    /// Submaps that an alignment or a sighting names.
+    /// Submaps that an alignment, a sighting or a position names.
     pub fn tied_submaps(&self) -> BTreeSet<SubmapId> {
         let aligned = self.alignments.values().flat_map(|fact| [fact.i, fact.j]);
-        aligned.chain(self.sightings.values().flat_map(|fact| [fact.i, fact.j])).collect()
+        let sighted = self.sightings.values().flat_map(|fact| [fact.i, fact.j]);
+        aligned.chain(sighted).chain(self.positions.values().flat_map(|fact| [fact.i, fact.j])).collect()
     }
 
     /// The indices of every frame's submaps from the origin on, as far as each step between them is known.
@@ -337,158 +354,11 @@ impl Knowledge {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
-    use crate::ids::Hash;
-    use crate::time::Stamp;
-    use crate::wire::fact::{RefusalReason, ScaleKind};
-    use nalgebra::Vector3;
-
-    fn frame(robot: u8) -> FrameId {
-        FrameId { robot: RobotId([robot; 8]), epoch: 1 }
-    }
-
-    fn entry(robot: u8, seq: u32) -> EntryId {
-        EntryId { frame: frame(robot), seq }
-    }
-
-    fn anchor(robot: u8) -> SubmapId {
-        SubmapId { frame: frame(robot), index: 0 }
-    }
-
-    fn pose(x: f64, sigma: f64) -> PoseWithCovariance {
-        let covariance = Covariance::from_sigmas([sigma; 6]).unwrap();
-        PoseWithCovariance { pose: Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0)), covariance }
-    }
-
-    fn submap() -> Fact {
-        Fact::Submap(SubmapFact {
-            index: 0,
-            stamps: [Stamp(0), Stamp(1)],
-            odometry: pose(0.0, 1e-4),
-            extent: [1.0; 3],
-            summary: vec![],
-            keypoint_count: 1,
-            blob: Hash::default(),
-            scale: ScaleKind::Metric,
-        })
-    }
-
-    fn alignment(i: u8, j: u8, x: f64, sigma: f64) -> Fact {
-        let t_i_j = Relative::Metric(pose(x, sigma));
-        let (i, j) = (anchor(i), anchor(j));
-        let blobs = [Hash::default(); 2];
-        Fact::Alignment(AlignmentFact { i, j, t_i_j, sigma: 0.01, support: 20, log10_nfa: -9.0, blobs })
-    }
-
-    fn verdict(alignment: EntryId, x: f64, sigma: f64) -> Fact {
-        let t_i_j = Relative::Metric(pose(x, sigma));
-        Fact::Verdict(VerdictFact { alignment, outcome: VerdictOutcome::Measured { t_i_j, sigma: 0.01, support: 20 } })
-    }
-
-    /// The problem of a robot that no fact is about.
-    fn problem(knowledge: &Knowledge) -> MapProblem {
-        knowledge.question(frame(9), |_| Some(pose(0.0, 1e-4))).problem
-    }
-
-    /// Robots 1 and 2, one submap each, and what else they say.
-    fn knowledge(facts: &[(EntryId, Fact)]) -> Knowledge {
-        let mut knowledge = Knowledge::default();
-        for (id, fact) in [(entry(1, 0), submap()), (entry(2, 0), submap())].iter().chain(facts) {
-            knowledge.absorb(*id, fact.clone());
-        }
-        knowledge
-    }
-
-    #[test]
-    fn an_alignment_moves_nothing_until_the_other_endpoint_measured_the_same() {
-        let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
-        let alone = knowledge(std::slice::from_ref(&stated));
-        assert_eq!(alone.agreement(stated.0), Agreement::Waiting);
-        assert!(problem(&alone).alignments.is_empty());
-        let agreed = knowledge(&[stated.clone(), (entry(2, 1), verdict(stated.0, 3.03, 0.02))]);
-        assert_eq!(agreed.agreement(stated.0), Agreement::Agreed);
-        assert_eq!(problem(&agreed).alignments.len(), 1);
-    }
-
-    #[test]
-    fn a_frame_that_nothing_ties_is_no_part_of_the_problem() {
-        let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
-        let lone = (entry(3, 0), submap());
-        let agreed = knowledge(&[stated.clone(), (entry(2, 1), verdict(stated.0, 3.0, 0.02)), lone]);
-        let frames = |own| agreed.question(frame(own), |_| Some(pose(0.0, 1e-4)));
-        let asked = frames(9);
-        assert!(asked.problem.frames.keys().eq([frame(1), frame(2)].iter()));
-        assert_eq!(asked.alone, BTreeMap::from([(frame(3), 1)]));
-        let asked = frames(3);
-        assert_eq!(asked.problem.frames.len(), 3, "unless it is our own");
-        assert!(asked.alone.is_empty());
-    }
-
-    #[test]
-    fn a_liar_moves_nothing() {
-        let lie = (entry(1, 1), alignment(1, 2, 30.0, 0.02));
-        let honest = (entry(2, 1), verdict(lie.0, 3.0, 0.02));
-        // The other endpoint measured something else, or found nothing.
-        assert_eq!(knowledge(&[lie.clone(), honest]).agreement(lie.0), Agreement::Disputed);
-        let refusal = VerdictOutcome::Refused(RefusalReason::NoConsensus);
-        let refused = (entry(2, 1), Fact::Verdict(VerdictFact { alignment: lie.0, outcome: refusal }));
-        assert_eq!(knowledge(&[lie.clone(), refused]).agreement(lie.0), Agreement::Disputed);
-        // The liar's own verdict, and a third party's, count for nothing.
-        let own = (entry(1, 2), verdict(lie.0, 30.0, 0.02));
-        let third = (entry(3, 0), verdict(lie.0, 30.0, 0.02));
-        let known = knowledge(&[lie.clone(), own, third]);
-        assert_eq!(known.agreement(lie.0), Agreement::Waiting);
-        assert!(problem(&known).alignments.is_empty());
-        // A third party cannot state an alignment of others.
-        let foreign = (entry(3, 0), alignment(1, 2, 3.0, 0.02));
-        assert!(knowledge(&[foreign]).alignments().next().is_none());
-    }
-
-    #[test]
-    fn an_endpoint_that_sees_two_ways_tells_of_its_two_frames() {
-        let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
-        let refused = |robot: u8, reason| {
-            let outcome = VerdictOutcome::Refused(reason);
-            (entry(robot, 2), Fact::Verdict(VerdictFact { alignment: stated.0, outcome }))
-        };
-        let count = |facts: &[(EntryId, Fact)]| problem(&knowledge(facts)).ambiguous;
-        let both = BTreeMap::from([((frame(1), frame(2)), 1)]);
-        assert_eq!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous)]), both);
-        assert!(count(&[stated.clone(), refused(2, RefusalReason::NoConsensus)]).is_empty());
-        // Neither the writer nor anybody else can say so in its place.
-        assert!(count(&[stated.clone(), refused(1, RefusalReason::Ambiguous)]).is_empty());
-        assert!(count(&[stated.clone(), refused(3, RefusalReason::Ambiguous)]).is_empty());
-        // The same two submaps once more: agreed after all, or no more than one pair.
-        let again = (entry(2, 3), alignment(1, 2, 3.0, 0.02));
-        let answer = |outcome| (entry(1, 3), Fact::Verdict(VerdictFact { alignment: again.0, outcome }));
-        let twice = answer(VerdictOutcome::Refused(RefusalReason::Ambiguous));
-        assert_eq!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous), again.clone(), twice]), both);
-        let agreed = (entry(1, 3), verdict(again.0, 3.0, 0.02));
-        assert!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous), again.clone(), agreed]).is_empty());
-    }
-
-    #[test]
-    fn nobody_can_overstate_a_shared_measurement() {
-        let bold = (entry(1, 1), alignment(1, 2, 3.0, 0.001));
-        let sober = (entry(2, 1), verdict(bold.0, 3.01, 0.05));
-        let problem = problem(&knowledge(&[bold, sober]));
-        let Relative::Metric(used) = problem.alignments[0].t_i_j else { panic!("metric") };
-        assert!(used.covariance.sigmas()[0] >= 0.05);
-    }
-
-    #[test]
-    fn the_order_of_facts_changes_nothing() {
-        let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
-        let facts = [stated.clone(), (entry(2, 1), verdict(stated.0, 3.0, 0.02)), (entry(2, 2), submap())];
-        let forward = knowledge(&facts);
-        let mut backward = Knowledge::default();
-        for (id, fact) in facts.iter().rev().chain(&[(entry(2, 0), submap()), (entry(1, 0), submap())]) {
-            backward.absorb(*id, fact.clone());
-        }
-        assert_eq!(forward.agreement(stated.0), backward.agreement(stated.0));
-        assert_eq!(problem(&forward), problem(&backward));
-    }
+/// Whether the observer says where another robot is, and nobody else does.
+fn is_of_another(id: EntryId, i: SubmapId, j: SubmapId) -> bool {
+    i.frame.robot == id.frame.robot && j.frame.robot != id.frame.robot
 }
+
+#[cfg(test)]
+#[path = "knowledge_tests.rs"]
+mod tests;

@@ -8,6 +8,7 @@
 
 mod aligning;
 mod allowance;
+mod beacons;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
@@ -49,6 +50,7 @@ use mapping::Mapper;
 use negotiation::Negotiation;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
+use sighting::Positions;
 use solving::MapState;
 use stats::Stats;
 use std::collections::{BTreeMap, VecDeque};
@@ -62,7 +64,7 @@ pub use mapping::CLOCK_BACK_KEYFRAMES;
 pub use negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP,
 };
-pub use sighting::SIGHTING_AGE_SECS_MAX;
+pub use sighting::{SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
 pub use traffic::{POSTPONED_MAX, UNSENT_MAX};
 
 /// A clock that shows more (after 292 years, or because it is broken) stands still for the agent: pauses must end after
@@ -126,6 +128,7 @@ pub struct Agent {
     map: MapState,
     stats: Stats,
     condensing: Condensing,
+    positions: Positions,
     next_job: u64,
     next_query: u64,
 }
@@ -177,6 +180,7 @@ impl Agent {
             map: MapState::default(),
             stats: Stats::default(),
             condensing: Condensing::default(),
+            positions: Positions::default(),
             next_job: 1,
             next_query: 1,
         };
@@ -190,6 +194,7 @@ impl Agent {
         match input {
             Input::Keyframe(keyframe) => self.on_keyframe(keyframe),
             Input::Sighting(sighting) => self.on_sighting(&sighting),
+            Input::Position(sighting) => self.on_position(&sighting),
             Input::Received { from, channel, bytes } => self.on_received(from, channel, &bytes),
             Input::Asked { token, kind, bytes } => self.on_asked(token, kind, &bytes),
             Input::Answered { query, bytes } => self.on_answered(query, bytes.as_deref()),
@@ -317,7 +322,7 @@ impl Agent {
         // but news, and these are old.
         let mut calling = Vec::new();
         for (id, fact) in self.replica.facts() {
-            if matches!(fact, Fact::Alignment(_) | Fact::Sighting(_) | Fact::Condensed(_)) {
+            if matches!(fact, Fact::Alignment(_) | Fact::Condensed(_)) {
                 calling.push((id, fact.clone()));
             }
             self.knowledge.absorb(id, fact);

@@ -187,6 +187,7 @@ impl Agent {
                 kind: match edge.kind {
                     EdgeKind::Alignment => "alignment",
                     EdgeKind::Sighting => "sighting",
+                    EdgeKind::Position => "position",
                 }
                 .to_string(),
                 i: self.submap_name(measurement.i),

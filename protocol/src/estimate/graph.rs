@@ -27,12 +27,14 @@ pub enum Label {
     Alignment(EntryId),
     /// A direct measurement of another robot.
     Sighting(EntryId),
+    /// Where another robot was seen, completed to a pose ([`super::position`]).
+    Position(EntryId),
 }
 
 impl Label {
     /// Whether the rest of the map may find it wrong.
     pub(super) fn is_doubted(self) -> bool {
-        matches!(self, Self::Alignment(_) | Self::Sighting(_))
+        matches!(self, Self::Alignment(_) | Self::Sighting(_) | Self::Position(_))
     }
 }
 
@@ -223,9 +225,10 @@ impl Edge {
         Ok(Self { factor, i: a, j: b, information })
     }
 
-    /// Dimension of the residual.
+    /// Dimension of the measurement.
     pub(super) fn dimension(&self) -> usize {
         match self.factor.t_i_j {
+            Relative::Metric(_) if matches!(self.factor.label, Label::Position(_)) => super::position::DIMENSION,
             Relative::Metric(_) => 6,
             Relative::Similarity(_) => 7,
         }

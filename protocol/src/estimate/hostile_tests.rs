@@ -2,6 +2,7 @@
 
 use super::intake::{SIGMA_ROTATION_MAX, SIGMA_TRANSLATION_MAX};
 use super::joint::*;
+use super::position::{SeenPoint, StatedPoint};
 use super::test_graphs::*;
 use super::test_world::*;
 use crate::config::EstimateConfig;
@@ -98,15 +99,23 @@ fn any_problem() -> impl Strategy<Value = MapProblem> {
     let frames = prop::collection::btree_map((0..4u8).prop_map(frame), chain, 0..4);
     let lists = (prop::collection::vec(stated.clone(), 0..30), prop::collection::vec(stated, 0..5));
     let entry = (0..4u8, 0..30u32).prop_map(|(robot, seq)| EntryId { frame: frame(robot), seq });
+    let seen = (entry.clone(), id(), id(), any_measurement(), any_measurement()).prop_map(|(entry, i, j, a, b)| {
+        let covariance = Covariance::new_or_wider(a.covariance.matrix().fixed_view::<3, 3>(0, 0).into_owned());
+        let point = SeenPoint { p_i: a.pose.translation, p_j: b.pose.translation, covariance };
+        StatedPoint { entry, i, j, point }
+    });
+    let positions = prop::collection::vec(seen, 0..5);
     let share = prop_oneof![4 => 0.0..1.0, 1 => any::<f64>()];
     let common = prop::collection::btree_map(entry, share, 0..10);
     let two = (0..4u8, 0..4u8).prop_map(|(a, b)| (frame(a.min(b)), frame(a.max(b))));
     let ambiguous = prop::collection::btree_map(two, prop_oneof![0..9usize, Just(usize::MAX)], 0..4);
-    (frames, lists, common, ambiguous).prop_map(|(frames, (alignments, sightings), common, ambiguous)| MapProblem {
+    let problem = (frames, lists, positions, common, ambiguous);
+    problem.prop_map(|(frames, (alignments, sightings), positions, common, ambiguous)| MapProblem {
         ambiguous,
         frames,
         alignments,
         sightings,
+        positions,
         common,
     })
 }
@@ -119,7 +128,7 @@ proptest! {
         // A bar this low merges on nearly anything, so that the solver sees it.
         let config = EstimateConfig { alignments_min: 1, log10_nfa_max: 0.0, ..EstimateConfig::default() };
         let map = solve_map(&problem, &config);
-        prop_assert_eq!(map.edges().len(), problem.alignments.len() + problem.sightings.len());
+        prop_assert_eq!(map.edges().len(), problem.alignments.len() + problem.sightings.len() + problem.positions.len());
         prop_assert!(map.edges().iter().all(|e| e.is_used() == (e.weight > 0.0)));
         prop_assert!(map.chi2.is_finite());
         for &a in problem.frames.keys() {
@@ -134,6 +143,7 @@ proptest! {
         let mut shuffled = problem;
         shuffled.alignments.shuffle(&mut rng(seed));
         shuffled.sightings.shuffle(&mut rng(seed));
+        shuffled.positions.shuffle(&mut rng(seed));
         prop_assert_eq!(bits(&solve_map(&shuffled, &config)), bits(&map));
     }
 }

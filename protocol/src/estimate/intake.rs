@@ -6,8 +6,10 @@
 use super::distortion;
 use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
+use super::position::{DIMENSION, StatedPoint};
+use super::reweight::CHI2_999;
 use super::trajectory::Trajectory;
-use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative};
+use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative, So3};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
@@ -27,6 +29,8 @@ pub enum Kind {
     Alignment,
     /// Of another robot.
     Sighting,
+    /// Of another robot's place alone.
+    Position,
 }
 
 /// A frame's anchors by odometry alone.
@@ -58,12 +62,15 @@ impl Intake {
         let mut intake = Self { chains, unknown_scale, ambiguous, edges: Vec::new() };
         let alignments = sorted(&problem.alignments).into_iter().map(|m| (Kind::Alignment, m));
         let sightings = sorted(&problem.sightings).into_iter().map(|m| (Kind::Sighting, m));
+        let tied = alignments.chain(sightings).map(|(kind, measurement)| EdgeEstimate::new(kind, measurement));
+        let positions = sorted_points(&problem.positions).into_iter().map(EdgeEstimate::of_point);
         let (mut entries, mut submaps) = (BTreeSet::new(), BTreeMap::new());
-        for (kind, measurement) in alignments.chain(sightings) {
+        for edge in tied.chain(positions) {
+            let EdgeEstimate { kind, measurement, .. } = edge;
             let unused = intake.refusal(kind, &measurement, &mut entries, &mut submaps);
             let stated = if kind == Kind::Alignment { problem.common.get(&measurement.entry) } else { None };
             let common = distortion::bounded(stated.copied().unwrap_or(0.0));
-            intake.edges.push(EdgeEstimate { common, unused, ..EdgeEstimate::new(kind, measurement) });
+            intake.edges.push(EdgeEstimate { common, unused, ..edge });
         }
         distortion::charge(&mut intake.edges);
         for edge in &mut intake.edges {
@@ -97,7 +104,7 @@ impl Intake {
         if same_unit != matches!(m.t_i_j, Relative::Metric(_)) {
             return Some(Unused::Units);
         }
-        if kind == Kind::Sighting && same_frame {
+        if kind != Kind::Alignment && same_frame {
             return Some(Unused::SameFrame);
         }
         if !entries.insert((kind, m.entry)) {
@@ -122,6 +129,7 @@ impl Intake {
             Label::Odometry | Label::Cloud => return false,
             Label::Alignment(entry) => (Kind::Alignment, entry),
             Label::Sighting(entry) => (Kind::Sighting, entry),
+            Label::Position(entry) => (Kind::Position, entry),
         };
         let is_it = |e: &&mut EdgeEstimate| e.unused.is_none() && (e.kind, e.measurement.entry) == wanted;
         self.edges.iter_mut().find(is_it).map(|e| e.refuse(reason)).is_some()
@@ -153,7 +161,7 @@ impl Intake {
         place.into_iter().map(|(f, k)| (f, sets.root(k))).collect()
     }
 
-    /// Sets aside sightings between frames that alignments do not merge: a sighting alone never does.
+    /// Sets aside sightings between frames that alignments do not merge: sightings alone never do.
     pub(super) fn drop_stray_sightings(&mut self) {
         let groups = self.groups();
         let stray = |e: &&mut EdgeEstimate| {
@@ -172,7 +180,8 @@ impl Intake {
         let mut any = false;
         for edge in self.edges.iter_mut().filter(|e| e.is_waiting()) {
             let scale = edge.sigma_scale(sigma_scales);
-            if edge.disagreement(scale, &relative).is_some_and(|d| d.is_consistent()) {
+            edge.complete(&relative);
+            if edge.disagreement(scale, &relative).is_some_and(|d| edge.is_consistent(&d)) {
                 (edge.weight, edge.unused) = (edge.weight_at(scale), None);
                 any = true;
             }
@@ -203,6 +212,25 @@ impl EdgeEstimate {
             Some(Unused::Waiting) => self.kind == Kind::Alignment,
             _ => false,
         }
+    }
+
+    /// A point that was seen, as a pose that the map completes later.
+    fn of_point(stated: StatedPoint) -> Self {
+        let StatedPoint { entry, i, j, point } = stated;
+        let measurement = AgreedAlignment { entry, i, j, t_i_j: point.completed(&So3::identity()) };
+        Self { point: Some(point), ..Self::new(Kind::Position, measurement) }
+    }
+
+    /// Turns what was seen of a point as the map says.
+    fn complete(&mut self, relative: impl Fn(SubmapId, SubmapId) -> Option<Relative>) {
+        if let Some((point, predicted)) = self.point.zip(relative(self.measurement.i, self.measurement.j)) {
+            self.measurement.t_i_j = point.completed(&predicted.sim().rotation);
+        }
+    }
+
+    /// Whether an honest measurement would be so far off at most 999 times in 1,000.
+    fn is_consistent(&self, d: &Disagreement) -> bool {
+        if self.point.is_some() { d.distance_squared <= CHI2_999[DIMENSION - 1] } else { d.is_consistent() }
     }
 
     /// The factor that its pair found its standard deviations to need.
@@ -291,6 +319,16 @@ fn says_nothing(t: &Relative) -> bool {
     of_translation.iter().any(|&s| s > SIGMA_TRANSLATION_MAX)
         || of_rotation.iter().any(|&s| s > SIGMA_ROTATION_MAX)
         || of_scale > SIGMA_LOG_SCALE_MAX
+}
+
+fn sorted_points(list: &[StatedPoint]) -> Vec<StatedPoint> {
+    let numbers = |a: &StatedPoint, b: &StatedPoint| {
+        let by_number = a.point.numbers().zip(b.point.numbers()).map(|(x, y)| x.total_cmp(&y));
+        by_number.into_iter().find(|order| order.is_ne()).unwrap_or(core::cmp::Ordering::Equal)
+    };
+    let mut out = list.to_vec();
+    out.sort_by(|a, b| (a.entry, a.i, a.j).cmp(&(b.entry, b.i, b.j)).then_with(|| numbers(a, b)));
+    out
 }
 
 fn sorted(list: &[AgreedAlignment]) -> Vec<AgreedAlignment> {

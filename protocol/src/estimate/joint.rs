@@ -14,6 +14,7 @@ use super::intake::{Intake, Kind};
 use super::marginals::certain;
 use super::optimality::Optimality;
 use super::pairs::{self, Pair};
+use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
 use super::solve::{Solution, SolveError, solve};
 use crate::config::EstimateConfig;
@@ -58,6 +59,8 @@ pub struct MapProblem {
     pub alignments: Vec<AgreedAlignment>,
     /// Direct measurements of other robots.
     pub sightings: Vec<AgreedAlignment>,
+    /// Where other robots were seen, not how they were turned.
+    pub positions: Vec<StatedPoint>,
     /// Alignments whose errors are not their own: which share of the variance each other alignment of the one submap has
     /// in common with it, and as much of the other; 0 to 0.45 ([`COMMON_MAX`](super::distortion::COMMON_MAX)), 0 for what
     /// is not listed.
@@ -126,9 +129,9 @@ pub enum Unused {
 /// A measurement and what became of it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EdgeEstimate {
-    /// Alignment or sighting.
+    /// Alignment, sighting or position.
     pub kind: Kind,
-    /// As it was given.
+    /// As it was given, or, of a position, as the map completed it.
     pub measurement: AgreedAlignment,
     /// What its information was multiplied by; 0 if unused.
     pub weight: f64,
@@ -136,6 +139,8 @@ pub struct EdgeEstimate {
     pub(super) common: f64,
     /// What that costs where alignments are taken as independent.
     pub(super) charges: Charges,
+    /// Of a position, what was seen.
+    pub(super) point: Option<SeenPoint>,
     /// Why it does not count; `None` if it does.
     pub unused: Option<Unused>,
 }
@@ -290,7 +295,7 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
 
 impl EdgeEstimate {
     pub(super) fn new(kind: Kind, measurement: AgreedAlignment) -> Self {
-        Self { kind, measurement, weight: 0.0, common: 0.0, charges: Charges::default(), unused: None }
+        Self { kind, measurement, weight: 0.0, common: 0.0, charges: Charges::default(), point: None, unused: None }
     }
 
     pub(super) fn factor(&self) -> Factor {
@@ -298,6 +303,7 @@ impl EdgeEstimate {
         let label = match self.kind {
             Kind::Alignment => Label::Alignment(entry),
             Kind::Sighting => Label::Sighting(entry),
+            Kind::Position => Label::Position(entry),
         };
         Factor { label, i, j, t_i_j, weight: self.weight }
     }

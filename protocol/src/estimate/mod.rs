@@ -14,6 +14,7 @@ mod minimise;
 pub mod optimality;
 mod pairs;
 pub mod posegraph;
+pub mod position;
 pub mod residual;
 mod reweight;
 pub mod solve;

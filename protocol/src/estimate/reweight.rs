@@ -48,7 +48,8 @@ pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
     let tested = solution.graph().edges().iter().filter(|e| e.factor.label.is_doubted());
     let failing = tested.filter_map(|edge| {
         let LeftOut { chi2, dof, .. } = leave_one_out(solution, &inverse, edge)?;
-        let limit = CHI2_999.get(dof.checked_sub(1)?)?;
+        // A position says nothing of how what it saw is turned.
+        let limit = CHI2_999.get(dof.min(edge.dimension()).checked_sub(1)?)?;
         (chi2 > *limit).then_some((chi2 / limit, Drop { label: edge.factor.label, chi2 }))
     });
     let mut failing: Vec<(f64, Drop)> = failing.collect();

@@ -12,7 +12,9 @@
 
 use super::smooth::{Node, Seen, between, smooth};
 use super::{Sighting, Speed};
+use crate::agent::io::PositionSighting;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use crate::ids::Name;
 use crate::submap::{CovarianceOf, Keyframe, Mark};
 use crate::time::Stamp;
 use libm::{atan2, cos, sin};
@@ -45,6 +47,8 @@ const SCALES: (f64, f64) = (0.15, 0.01);
 const OUT_OF_PLANE: (f64, f64) = (1e-3, 1e-4);
 /// The same of what it sees there, m.
 const FLAT: f64 = 1e-3;
+/// Standard deviation of the height of another robot, m: nothing tells it.
+const HEIGHT: f64 = 0.1;
 /// Longest time for which a commanded speed holds, s; a log that pauses longer was interrupted.
 const HOLD_SECS: f64 = 1.5;
 /// Standard deviation of the way that such a pause may hide, m and rad.
@@ -113,6 +117,14 @@ pub fn keyframes(speeds: &[Speed], sightings: &[Sighting]) -> Vec<Keyframe> {
         });
     }
     keyframes
+}
+
+/// Where another robot was seen, in the body frame. Nothing tells how high.
+pub fn position(sighting: &Sighting, robot: Name) -> PositionSighting {
+    let Seen { at, covariance, .. } = from_body(sighting);
+    let (xx, xy, yy) = (covariance[(0, 0)], covariance[(0, 1)], covariance[(1, 1)]);
+    let covariance = [xx, xy, 0.0, yy, 0.0, HEIGHT * HEIGHT];
+    PositionSighting { stamp: sighting.stamp, robot, position: [at.x, at.y, 0.0], covariance }
 }
 
 fn in_space(pose: &Vector3<f64>) -> Se3 {

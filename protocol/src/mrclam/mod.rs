@@ -10,7 +10,7 @@
 mod front;
 mod smooth;
 
-pub use front::{Calibration, keyframes};
+pub use front::{Calibration, keyframes, position};
 
 use crate::line_error::LineError;
 use crate::time::Stamp;

@@ -1,7 +1,7 @@
 //! Facts in domain form: what an entry's payload means once it has been parsed. Every value here is already checked:
 //! finite, unit norm, positive definite, bounded.
 
-use crate::geometry::{PoseWithCovariance, Relative};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative};
 use crate::ids::{EntryId, Hash, SubmapId};
 use crate::time::Stamp;
 use serde::{Deserialize, Serialize};
@@ -19,6 +19,8 @@ pub enum Fact {
     Sighting(SightingFact),
     /// What still counts of the writer's entries below its floor.
     Condensed(CondensedFact),
+    /// Where another robot was seen, not how it was turned.
+    Position(PositionFact),
 }
 
 /// Whether a frame's unit is the metre.
@@ -128,6 +130,24 @@ pub struct SightingFact {
     pub j: SubmapId,
     /// `t_i_j`.
     pub t_i_j: PoseWithCovariance,
+}
+
+/// Where another robot was seen (range and bearing), carried to anchors by the observer: a point of one submap, seen from
+/// another.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PositionFact {
+    /// When, on the observer's clock.
+    pub stamp: Stamp,
+    /// The observer's submap anchor.
+    pub i: SubmapId,
+    /// The observed robot's submap anchor, as its beacon named it.
+    pub j: SubmapId,
+    /// Where the body was seen, in the frame of `i`'s anchor, m.
+    pub p_i: [f32; 3],
+    /// Where it was by its own beacon, in the frame of `j`'s anchor, m.
+    pub p_j: [f32; 3],
+    /// Of the one less the other, along the axes of `i`'s anchor, m².
+    pub covariance: Covariance<3>,
 }
 
 /// A part of what still counts of the entries below the writer's floor (DESIGN §3, §7): facts that are carried on, each

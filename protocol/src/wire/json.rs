@@ -114,6 +114,14 @@ fn fact(of: &Fact) -> Value {
             "j": f.j.to_string(),
             "t_i_j": pose(&f.t_i_j),
         }),
+        Fact::Position(f) => json!({
+            "stamp_secs": f.stamp.as_secs_f64(),
+            "i": f.i.to_string(),
+            "j": f.j.to_string(),
+            "p_i": f.p_i,
+            "p_j": f.p_j,
+            "covariance": upper_triangle(f.covariance.matrix()),
+        }),
         Fact::Condensed(f) => json!({
             "carried": f.carried.iter().map(|one| json!({
                 "seq": one.seq,
@@ -136,14 +144,17 @@ fn relative(r: &Relative) -> Value {
     }
 }
 
+fn upper_triangle<const N: usize>(p: &SMatrix<f64, N, N>) -> Vec<f64> {
+    (0..N).flat_map(|r| (r..N).map(move |c| p[(r, c)])).collect()
+}
+
 /// As `snapshot::RelationView`: the covariance is its upper triangle, row by row, tangent order (ρ, φ[, λ]).
 fn estimate<const N: usize>(t: &Sim3, p: &SMatrix<f64, N, N>) -> Value {
     let translation: [f64; 3] = t.translation.into();
-    let covariance: Vec<f64> = (0..N).flat_map(|r| (r..N).map(move |c| p[(r, c)])).collect();
     let sigmas: Vec<f64> = (0..N).map(|i| p[(i, i)].sqrt()).collect();
     json!({
         "pose": { "translation": translation, "rotation": t.rotation.xyzw(), "scale": t.scale },
-        "covariance": covariance,
+        "covariance": upper_triangle(p),
         "sigmas": sigmas,
     })
 }

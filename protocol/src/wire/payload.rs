@@ -4,11 +4,11 @@
 
 use super::condensed::RawCondensed;
 use super::fact::{
-    AlignmentFact, Fact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
+    AlignmentFact, Fact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
 };
 use super::frame::to_bytes;
 use super::limits::{self, LENGTH_MAX, PAYLOAD_LEN_MAX, SUMMARY_LEN_MAX};
-use super::pose::{EstimateError, RawPoseWithCovariance, RawSimWithCovariance};
+use super::pose::{EstimateError, RawPointCovariance, RawPoseWithCovariance, RawSimWithCovariance};
 use crate::geometry::Relative;
 use crate::ids::{EntryId, Hash, SubmapId};
 use crate::time::Stamp;
@@ -25,6 +25,8 @@ pub const KIND_VERDICT: u8 = 3;
 pub const KIND_SIGHTING: u8 = 4;
 /// Entry kind of a [`CondensedFact`](super::fact::CondensedFact).
 pub const KIND_CONDENSED: u8 = 5;
+/// Entry kind of a [`PositionFact`].
+pub const KIND_POSITION: u8 = 6;
 
 /// Why a payload is no fact, or a fact cannot be written. No state changes.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -86,6 +88,7 @@ impl Fact {
             Self::Verdict(_) => KIND_VERDICT,
             Self::Sighting(_) => KIND_SIGHTING,
             Self::Condensed(_) => KIND_CONDENSED,
+            Self::Position(_) => KIND_POSITION,
         }
     }
 
@@ -97,6 +100,7 @@ impl Fact {
             KIND_VERDICT => "verdict",
             KIND_SIGHTING => "sighting",
             KIND_CONDENSED => "condensed",
+            KIND_POSITION => "position",
             _ => "unknown",
         }
     }
@@ -145,6 +149,7 @@ enum Raw {
     Verdict(RawVerdict),
     Sighting(RawSighting),
     Condensed(RawCondensed),
+    Position(RawPosition),
 }
 
 impl Raw {
@@ -155,6 +160,7 @@ impl Raw {
             Fact::Verdict(f) => Self::Verdict(RawVerdict::of(f)?),
             Fact::Sighting(f) => Self::Sighting(RawSighting::of(f)?),
             Fact::Condensed(f) => Self::Condensed(RawCondensed::of(f)?),
+            Fact::Position(f) => Self::Position(RawPosition::of(f)?),
         })
     }
 
@@ -165,6 +171,7 @@ impl Raw {
             Self::Verdict(raw) => Fact::Verdict(raw.parse()?),
             Self::Sighting(raw) => Fact::Sighting(raw.parse()?),
             Self::Condensed(raw) => Fact::Condensed(raw.parse()?),
+            Self::Position(raw) => Fact::Position(raw.parse()?),
         })
     }
 
@@ -175,6 +182,7 @@ impl Raw {
             Self::Verdict(raw) => to_bytes(raw),
             Self::Sighting(raw) => to_bytes(raw),
             Self::Condensed(raw) => to_bytes(raw),
+            Self::Position(raw) => to_bytes(raw),
         }
     }
 
@@ -185,6 +193,7 @@ impl Raw {
             KIND_VERDICT => Self::Verdict(whole(bytes)?),
             KIND_SIGHTING => Self::Sighting(whole(bytes)?),
             KIND_CONDENSED => Self::Condensed(whole(bytes)?),
+            KIND_POSITION => Self::Position(whole(bytes)?),
             other => return Err(FactError::UnknownKind(other)),
         })
     }
@@ -369,6 +378,39 @@ impl RawSighting {
         different(self.i, self.j)?;
         Ok(SightingFact { stamp: self.stamp, i: self.i, j: self.j, t_i_j: parsed(&self.t_i_j, "t_i_j")? })
     }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct RawPosition {
+    stamp: Stamp,
+    i: SubmapId,
+    j: SubmapId,
+    p_i: [f32; 3],
+    p_j: [f32; 3],
+    covariance: RawPointCovariance,
+}
+
+impl RawPosition {
+    fn of(f: &PositionFact) -> Result<Self, FactError> {
+        different(f.i, f.j)?;
+        let why = |why| FactError::Estimate { field: "covariance", why };
+        let covariance = RawPointCovariance::of(&f.covariance).map_err(why)?;
+        let (p_i, p_j) = (point(f.p_i, "p_i")?, point(f.p_j, "p_j")?);
+        Ok(Self { stamp: f.stamp, i: f.i, j: f.j, p_i, p_j, covariance })
+    }
+
+    fn parse(&self) -> Result<PositionFact, FactError> {
+        different(self.i, self.j)?;
+        let why = |why| FactError::Estimate { field: "covariance", why };
+        let covariance = self.covariance.parse().map_err(why)?;
+        let (p_i, p_j) = (point(self.p_i, "p_i")?, point(self.p_j, "p_j")?);
+        Ok(PositionFact { stamp: self.stamp, i: self.i, j: self.j, p_i, p_j, covariance })
+    }
+}
+
+fn point(p: [f32; 3], field: &'static str) -> Result<[f32; 3], FactError> {
+    check(p.iter().all(|c| c.abs() <= LENGTH_MAX), field, "must be finite, within 1e6")?;
+    Ok(p)
 }
 
 fn pose(p: &crate::geometry::PoseWithCovariance, field: &'static str) -> Result<RawPoseWithCovariance, FactError> {

@@ -4,7 +4,7 @@
 
 use super::lattice::{BEACON_BITS, FACT_BITS, Lattice};
 use super::limits::{SCALE_MAX, TRANSLATION_MAX};
-use crate::geometry::{CovarianceError, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3};
+use crate::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -113,6 +113,24 @@ pub(super) struct RawPoseWithCovariance {
     pose: RawPose,
     exponents: [i8; 6],
     factor: [i32; 21],
+}
+
+/// The covariance of a point in a fact.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct RawPointCovariance {
+    exponents: [i8; 3],
+    factor: [i32; 6],
+}
+
+impl RawPointCovariance {
+    pub fn of(covariance: &Covariance<3>) -> Result<Self, EstimateError> {
+        let lattice = Lattice::encode(covariance, FACT_BITS)?;
+        Ok(Self { exponents: lattice.exponents, factor: packed(&lattice.factor) })
+    }
+
+    pub fn parse(&self) -> Result<Covariance<3>, EstimateError> {
+        Ok(Lattice { exponents: self.exponents, factor: unpacked(&self.factor) }.decode(FACT_BITS)?)
+    }
 }
 
 /// A pose or a covariance that cannot be read or written.

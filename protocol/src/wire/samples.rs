@@ -110,6 +110,16 @@ samples! {
             })
         }
         Fact::Condensed(_) => { "condensed" => condensed_fact() }
+        Fact::Position(_) => {
+            "position" => Fact::Position(PositionFact {
+                stamp: Stamp(1_700_000_000_123_456_789),
+                i: submap(0, 7),
+                j: submap(1, 4),
+                p_i: [2.5, -0.75, 0.125],
+                p_j: [0.5, 0.25, 0.0],
+                covariance: Covariance::from_sigmas([0.25, 0.125, 0.5]).unwrap(),
+            })
+        }
     }
 }
 

@@ -429,7 +429,14 @@ fn fact() -> impl Strategy<Value = Fact> {
         let (i, j) = (samples::submap(0, 7), samples::submap(1, 4));
         Fact::Sighting(SightingFact { stamp: Stamp(stamp), i, j, t_i_j })
     });
-    prop_oneof![submap, alignment, verdict, sighting]
+    let position = (rigid(), any::<i64>()).prop_map(|(t, stamp)| {
+        let (i, j) = (samples::submap(0, 7), samples::submap(1, 4));
+        let p_i = t.pose.translation.map(|x| (x as f32).clamp(-1e6, 1e6)).into();
+        let p_j = t.covariance.sigmas().fixed_rows::<3>(0).map(|x| x as f32).into();
+        let covariance = Covariance::new_or_wider(t.covariance.matrix().fixed_view::<3, 3>(3, 3).into_owned());
+        Fact::Position(PositionFact { stamp: Stamp(stamp), i, j, p_i, p_j, covariance })
+    });
+    prop_oneof![submap, alignment, verdict, sighting, position]
 }
 
 proptest! {

@@ -4,12 +4,12 @@
 use super::people::{AGENTS, ROBOTS, described, key, robot, sigmas, swarm};
 use super::reader::Reader;
 use merganser_protocol::agent::io::QueryKind;
-use merganser_protocol::geometry::{PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::{
-    AlignmentFact, CarriedFact, CondensedFact, Fact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact,
-    VerdictOutcome,
+    AlignmentFact, CarriedFact, CondensedFact, Fact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact,
+    VerdictFact, VerdictOutcome,
 };
 use merganser_protocol::wire::limits::{BLOB_PIECE_LEN, PAYLOAD_LEN_MAX};
 use merganser_protocol::wire::{
@@ -119,7 +119,16 @@ impl Forge {
             }
             6 => {
                 let (i, j) = (self.submap(r), self.submap(r));
-                Fact::Sighting(SightingFact { stamp: Stamp(r.u64() as i64), i, j, t_i_j: pose(r) })
+                let stamp = Stamp(r.u64() as i64);
+                let seen = pose(r);
+                if r.one_in(2) {
+                    let p_i = seen.pose.translation.map(|x| x as f32).into();
+                    let covariance =
+                        Covariance::new_or_wider(seen.covariance.matrix().fixed_view::<3, 3>(0, 0).into_owned());
+                    Fact::Position(PositionFact { stamp, i, j, p_i, p_j: [0.5, 0.0, -0.25], covariance })
+                } else {
+                    Fact::Sighting(SightingFact { stamp, i, j, t_i_j: seen })
+                }
             }
             _ => {
                 let (kind, len) = (r.byte() % 8, r.below(64));

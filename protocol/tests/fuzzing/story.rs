@@ -7,7 +7,9 @@ use super::checks::{Asked, Shell};
 use super::forge::{self, Forge};
 use super::people::{AGENTS, ROBOTS, SCAN, agent, name, robot, scan};
 use super::reader::Reader;
-use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, JobId, QueryId, QueryKind, Record, Sighting};
+use merganser_protocol::agent::io::{
+    AskToken, Channel, Command, Input, JobId, PositionSighting, QueryId, QueryKind, Record, Sighting,
+};
 use merganser_protocol::agent::job::{JobResult, Measured};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::ids::RobotId;
@@ -307,6 +309,13 @@ impl<'m, M: Meter> Story<'m, M> {
             covariance[diagonal] = 0.01;
         }
         let plain = r.byte() < 128;
+        if r.one_in(2) {
+            let robot = name(r.below(ROBOTS));
+            let (position, covariance) =
+                if plain { ([1.0, 2.0, 0.0], [0.01, 0.0, 0.0, 0.01, 0.0, 0.01]) } else { (r.numbers(), r.numbers()) };
+            let sighting = PositionSighting { stamp: Stamp(self.stamp), robot, position, covariance };
+            return self.give(k, Input::Position(sighting));
+        }
         let sighting = Sighting {
             stamp: Stamp(self.stamp),
             robot: name(r.below(ROBOTS)),

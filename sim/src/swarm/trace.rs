@@ -19,6 +19,7 @@ impl Trace {
         match input {
             Input::Keyframe(keyframe) => self.line(now, robot, "keyframe", &[&keyframe_digest(keyframe)]),
             Input::Sighting(s) => self.line(now, robot, "sighting", &[format!("{s:?}").as_bytes()]),
+            Input::Position(s) => self.line(now, robot, "position", &[format!("{s:?}").as_bytes()]),
             Input::Received { from, channel, bytes } => {
                 self.line(now, robot, "received", &[&from.0, &[*channel as u8], bytes]);
             }

@@ -1,0 +1,172 @@
+use super::*;
+
+fn message() -> KeyframeMessage {
+    let mut covariance = [0.0; 21];
+    for (i, start) in [0, 6, 11, 15, 18, 20].into_iter().enumerate() {
+        covariance[start] = 1e-4 * (i + 1) as f64;
+    }
+    KeyframeMessage {
+        stamp_ns: -5,
+        translation: [1.0, 2.0, 3.0],
+        rotation: [0.1, 0.2, 0.3, 0.9],
+        covariance,
+        covariance_of: CovarianceOf::Pose,
+        points: vec![[1.0, 2.0, 3.0], [-1.0, 0.5, 0.25]],
+        landmarks: vec![],
+        place: None,
+    }
+}
+
+fn of_a_place() -> KeyframeMessage {
+    let place = PlaceMessage { model: "net".into(), metric: Metric::Euclidean, vector: vec![0.25, -3.0, 1.5] };
+    KeyframeMessage { place: Some(place), ..message() }
+}
+
+fn of_landmarks() -> KeyframeMessage {
+    let covariance = [0.01, 0.001, 0.0, 0.02, 0.0, 0.03];
+    let named = LandmarkMessage { covariance, label: Some(72), descriptor: None };
+    let described = LandmarkMessage { covariance, label: None, descriptor: Some([7; 32]) };
+    KeyframeMessage { landmarks: vec![named, described], ..message() }
+}
+
+#[test]
+fn landmarks_travel_with_their_points() {
+    let json = serde_json::to_vec(&of_landmarks()).unwrap();
+    let postcard = postcard::to_stdvec(&of_landmarks()).unwrap();
+    let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+    assert_eq!(a, b);
+    assert_eq!((a.marks[0].label, a.marks[1].descriptor), (Some(72), Some([7; 32])));
+    assert_eq!(KeyframeMessage::from(&a).landmarks, of_landmarks().landmarks);
+}
+
+#[test]
+fn a_place_travels_and_is_checked() {
+    let json = serde_json::to_vec(&of_a_place()).unwrap();
+    let postcard = postcard::to_stdvec(&of_a_place()).unwrap();
+    let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+    assert_eq!(a, b);
+    assert_eq!(KeyframeMessage::from(&a), KeyframeMessage { rotation: a.pose.pose.rotation.xyzw(), ..of_a_place() });
+    let mut zero = of_a_place();
+    zero.place.as_mut().unwrap().vector = vec![0.0; 3];
+    assert_eq!(Keyframe::try_from(zero), Err(ObservationError::Place(PlaceError::Zero)));
+    let written = br#"{"metric": "cosine", "vector": [1, 2]}"#;
+    assert_eq!(serde_json::from_slice::<PlaceMessage>(written).unwrap().model, "");
+}
+
+#[test]
+fn what_was_sent_before_there_were_places_or_landmarks_is_understood() {
+    let whole = |message: &KeyframeMessage| postcard::to_stdvec(message).unwrap();
+    let of = |bytes: &[u8]| keyframe(Format::Postcard, bytes);
+    let (plain, marked, placed) = (whole(&message()), whole(&of_landmarks()), whole(&of_a_place()));
+    assert!(plain.ends_with(&[0, 0]) && marked.ends_with(&[0]));
+    for missing in [1, 2] {
+        assert_eq!(of(&plain[..plain.len() - missing]), of(&plain));
+    }
+    assert_eq!(of(&marked[..marked.len() - 1]), of(&marked));
+    // Anything shorter was cut.
+    for (bytes, known) in [(&plain, plain.len() - 2), (&marked, marked.len() - 1), (&placed, placed.len())] {
+        // Up to the end of its points or of no landmarks, it is a plain one.
+        let is_plain = |len: usize| (plain.len() - 2..plain.len()).contains(&len) && plain.starts_with(&bytes[..len]);
+        for len in (0..known).filter(|&len| !is_plain(len)) {
+            assert!(of(&bytes[..len]).is_err(), "cut to {len} of {}", bytes.len());
+        }
+    }
+    for extra in [&[0][..], &[0, 0], &[1]] {
+        let longer = [&plain[..], extra].concat();
+        assert_eq!(of(&longer), Err(ObservationError::Trailing(extra.len())));
+    }
+}
+
+#[test]
+fn landmarks_that_do_not_fit_are_refused() {
+    let told = |change: &dyn Fn(&mut KeyframeMessage)| {
+        let mut message = of_landmarks();
+        change(&mut message);
+        Keyframe::try_from(message).map(drop)
+    };
+    assert_eq!(told(&|_| ()), Ok(()));
+    assert_eq!(told(&|m| m.landmarks.truncate(1)), Err(ObservationError::Landmarks { points: 2, landmarks: 1 }));
+    let error = CovarianceError::NotPositiveDefinite;
+    let refused = ObservationError::LandmarkCovariance { index: 1, error };
+    assert_eq!(told(&|m| m.landmarks[1].covariance[1] = 0.5), Err(refused));
+    let refused = ObservationError::LandmarkCovariance { index: 0, error: CovarianceError::NotFinite };
+    assert_eq!(told(&|m| m.landmarks[0].covariance[5] = f64::NAN), Err(refused));
+}
+
+#[test]
+fn json_and_postcard_say_the_same() {
+    let json = serde_json::to_vec(&message()).unwrap();
+    let postcard = postcard::to_stdvec(&message()).unwrap();
+    let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+    assert_eq!(a, b);
+    assert_eq!((a.stamp, a.covariance_of, a.points.len()), (Stamp(-5), CovarianceOf::Pose, 2));
+}
+
+#[test]
+fn the_documented_json_is_a_keyframe() {
+    let text: String = include_str!("observation.rs")
+        .lines()
+        .skip_while(|line| *line != "//! ```json")
+        .skip(1)
+        .take_while(|line| *line != "//! ```")
+        .map(|line| line.trim_start_matches("//!"))
+        .collect();
+    keyframe(Format::Json, text.as_bytes()).unwrap();
+}
+
+#[test]
+fn each_damage_is_refused() {
+    let refused = |change: &dyn Fn(&mut KeyframeMessage)| {
+        let mut bad = message();
+        change(&mut bad);
+        keyframe(Format::Postcard, &postcard::to_stdvec(&bad).unwrap()).unwrap_err()
+    };
+    assert_eq!(refused(&|m| m.translation[1] = f64::NAN), ObservationError::Number("translation"));
+    assert_eq!(refused(&|m| m.translation[1] = 2.0 * COORDINATE_MAX), ObservationError::Number("translation"));
+    assert_eq!(refused(&|m| m.rotation = [0.0; 4]), ObservationError::Rotation);
+    assert_eq!(refused(&|m| m.points[1][2] = f32::INFINITY), ObservationError::Number("points"));
+    assert_eq!(refused(&|m| m.points = vec![[0.0; 3]; POINTS_MAX + 1]), ObservationError::Points(POINTS_MAX + 1));
+    assert!(matches!(refused(&|m| m.covariance[6] = -1.0), ObservationError::Covariance(_)));
+    assert!(matches!(refused(&|m| m.covariance[1] = 1.0), ObservationError::Covariance(_)));
+}
+
+#[test]
+fn decoding_takes_the_whole_input_and_known_fields_alone() {
+    let good = postcard::to_stdvec(&message()).unwrap();
+    let long = [good, vec![0, 0]].concat();
+    assert_eq!(keyframe(Format::Postcard, &long), Err(ObservationError::Trailing(2)));
+    let mut json = serde_json::to_value(message()).unwrap();
+    json["colour"] = 1.into();
+    assert!(matches!(keyframe(Format::Json, json.to_string().as_bytes()), Err(ObservationError::Json(_))));
+}
+
+#[test]
+fn a_sighting_is_checked_like_a_keyframe() {
+    let m = message();
+    let (translation, rotation, covariance) = (m.translation, m.rotation, m.covariance);
+    let robot = Name::new("beta").unwrap();
+    let good = SightingMessage { stamp_ns: 7, robot, translation, rotation, covariance };
+    let json = serde_json::to_vec(&good).unwrap();
+    let seen = sighting(Format::Json, &json).unwrap();
+    assert_eq!((seen.stamp, seen.covariance), (Stamp(7), covariance));
+    let bad = SightingMessage { rotation: [0.0; 4], ..good };
+    assert_eq!(Sighting::try_from(bad), Err(ObservationError::Rotation));
+}
+
+#[test]
+fn a_position_is_checked_too() {
+    let covariance = [0.01, 0.0, 0.0, 0.02, 0.0, 1.0];
+    let robot = Name::new("beta").unwrap();
+    let good = PositionMessage { stamp_ns: 7, robot, position: [1.0, 2.0, 0.0], covariance };
+    let seen = position(Format::Json, &serde_json::to_vec(&good).unwrap()).unwrap();
+    assert_eq!((seen.stamp, seen.position, seen.covariance), (Stamp(7), good.position, covariance));
+    assert_eq!(position(Format::Postcard, &postcard::to_stdvec(&good).unwrap()), Ok(seen));
+    let refused = |spoil: &dyn Fn(&mut PositionMessage)| {
+        let mut bad = good.clone();
+        spoil(&mut bad);
+        PositionSighting::try_from(bad).unwrap_err()
+    };
+    assert_eq!(refused(&|m| m.position[1] = f64::NAN), ObservationError::Number("position"));
+    assert!(matches!(refused(&|m| m.covariance[5] = 0.0), ObservationError::Covariance(_)));
+    assert!(matches!(refused(&|m| m.covariance[1] = 1.0), ObservationError::Covariance(_)));
+}
