@@ -127,11 +127,12 @@ async fn play(args: &DemoArgs, recordings: &[Recording], tracks: &[Track], work:
     if let Some(endpoint) = swarm.endpoints.first() {
         say(&format!("Look on meanwhile: merganser watch --no-multicast --connect {endpoint}\n"))?;
     }
-    let longest = recordings.iter().map(Recording::duration_secs).fold(0.0, f64::max);
-    let timeout = args.timeout.unwrap_or((longest / args.speed + TIMEOUT_AFTER_SECS).max(TIMEOUT_SECS));
+    let playing = recordings.iter().map(Recording::ends_after_secs).fold(0.0, f64::max) / args.speed;
+    let timeout = args.timeout.unwrap_or((playing + TIMEOUT_AFTER_SECS).max(TIMEOUT_SECS));
     let timeout = Duration::try_from_secs_f64(timeout).context("--timeout")?;
+    let playing = Duration::try_from_secs_f64(playing).context("--speed")?;
     let seen = tokio::select! {
-        seen = watch::watch(&mut swarm, tracks, timeout) => seen?,
+        seen = watch::watch(&mut swarm, tracks, playing, timeout) => seen?,
         told = interrupts.wait() => told?,
     };
     let memory = swarm.agents.iter().map(swarm::Agent::memory).collect();

@@ -48,16 +48,23 @@ pub(super) struct Seen {
     pub views: Vec<Views>,
 }
 
-/// Looks on until the end; `timeout` counts from now.
-pub(super) async fn watch(swarm: &mut Swarm, tracks: &[Track], timeout: Duration) -> Result<Seen> {
+/// Looks on until the end; `playing`, which the recordings take, and `timeout` count from now. While a recording plays, its
+/// robot may stand for minutes and drive on.
+pub(super) async fn watch(swarm: &mut Swarm, tracks: &[Track], playing: Duration, timeout: Duration) -> Result<Seen> {
     let config = ZenohConfig { connect: swarm.endpoints.clone(), multicast: false, ..ZenohConfig::default() };
     let session = session::open(&config, Role::Onlooker).await?;
-    let seen = look(&session, swarm, tracks, timeout).await;
+    let seen = look(&session, swarm, tracks, playing, timeout).await;
     session::close(&session, Duration::from_secs(1)).await;
     seen
 }
 
-async fn look(session: &Session, swarm: &mut Swarm, tracks: &[Track], timeout: Duration) -> Result<Seen> {
+async fn look(
+    session: &Session,
+    swarm: &mut Swarm,
+    tracks: &[Track],
+    playing: Duration,
+    timeout: Duration,
+) -> Result<Seen> {
     let bar = progress_bar(tracks);
     let start = Instant::now();
     let mut settling = Settling::default();
@@ -73,7 +80,7 @@ async fn look(session: &Session, swarm: &mut Swarm, tracks: &[Track], timeout: D
             break (Ending::Done, start.elapsed());
         }
         done_once = done;
-        if settling.look(&statuses) {
+        if settling.look(&statuses) && start.elapsed() > playing {
             break (Ending::Settled, start.elapsed());
         }
         if start.elapsed() > timeout {

@@ -144,6 +144,11 @@ impl Recording {
         }
     }
 
+    /// Time from the beginning to the last keyframe, s.
+    pub fn ends_after_secs(&self) -> f64 {
+        self.keyframes.last().map_or(0.0, |last| last.stamp.secs_since(self.begins()))
+    }
+
     /// The points of keyframe `index`, body frame, m.
     ///
     /// # Errors

@@ -10,8 +10,7 @@ use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, So3};
 use crate::ids::{EntryId, SubmapId};
 use nalgebra::{Matrix6, Vector3};
 
-/// Standard deviation of the rotation that is filled in, rad: below what counts as saying nothing
-/// ([`SIGMA_ROTATION_MAX`](super::intake::SIGMA_ROTATION_MAX)).
+/// Standard deviation of the rotation that is filled in, rad: below the 3 rad from which a measurement says nothing.
 pub const TURN_SIGMA: f64 = 2.5;
 /// Dimension of the measurement.
 pub(super) const DIMENSION: usize = 3;
