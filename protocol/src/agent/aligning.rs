@@ -143,6 +143,8 @@ impl Agent {
                 match may_wait {
                     true if !self.allowance.may_spend(self.now) => continue,
                     true => self.allowance.spend(self.now, bytes),
+                    // A loop of our own is stated once, and moves no keypoints.
+                    false if self.is_loop(mine, theirs) => {}
                     false => self.allowance.owe(self.now, bytes),
                 }
                 self.negotiation.begun.insert(pair);
