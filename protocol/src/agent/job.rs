@@ -165,6 +165,18 @@ impl Job {
             Self::Solve(_) => "solve",
         }
     }
+
+    /// Anchors and measurements that a solve is about, for cost models; 1 of other jobs.
+    pub fn size(&self) -> usize {
+        match self {
+            Self::Describe(_) | Self::Align(_) => 1,
+            Self::Solve(job) => {
+                let MapProblem { frames, alignments, sightings, positions, .. } = &job.problem;
+                let anchors: usize = frames.values().map(|frame| frame.odometry.len()).sum();
+                anchors + alignments.len() + sightings.len() + positions.len()
+            }
+        }
+    }
 }
 
 impl SolveJob {

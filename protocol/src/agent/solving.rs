@@ -12,6 +12,12 @@ use crate::wire::fact::{Fact, SubmapFact};
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 
+/// A solve is followed by a rest of so many times what it took, the wait for other jobs included: however large the map
+/// and small the computer, at least so much of a core is left to the rest of the robot.
+const REST: u32 = 4;
+/// Longest such rest: what has become known meanwhile is to be seen at last.
+const REST_MAX: Duration = Duration::from_secs(30);
+
 /// The joint estimate and the state of its solver.
 #[derive(Default)]
 pub(super) struct MapState {
@@ -23,6 +29,7 @@ pub(super) struct MapState {
     /// Facts came in since the last problem was posed.
     pub(super) dirty: bool,
     pub(super) solving: Option<JobId>,
+    posed_at: Instant,
     posed_digest: Hash,
     posed_from: Option<FrameId>,
     posed_alone: BTreeMap<FrameId, usize>,
@@ -51,6 +58,7 @@ impl Agent {
             let job = SolveJob { problem, config, own };
             (self.map.posed_from, self.map.posed_alone, self.map.posed_gaps) = (Some(own), alone, gaps);
             self.map.dirty = false;
+            self.map.posed_at = self.now;
             self.map.posed_digest = self.replica.digest();
             self.map.next_solve = self.now.after(Duration::from_secs_f64(self.config.estimate.interval_secs));
             self.map.solving = Some(self.run_job(Job::Solve(Box::new(job))));
@@ -61,6 +69,8 @@ impl Agent {
         if self.map.solving.take_if(|running| *running == job).is_none() {
             return;
         }
+        let rest = self.now.since(self.map.posed_at).saturating_mul(REST).min(REST_MAX);
+        self.map.next_solve = self.map.next_solve.max(self.now.after(rest));
         self.map.digest = self.map.posed_digest;
         self.map.seen_from = self.map.posed_from;
         self.map.alone = core::mem::take(&mut self.map.posed_alone);

@@ -7,7 +7,8 @@
 //!   neighbour that promises most, so that nothing is fetched twice. Small gains wait for more, large ones do not, nor
 //!   what follows a large one: after a partition the last few facts are as welcome as the first many.
 //!   A question that is overdue keeps nobody back: others are asked, then the same neighbour again, and what the lost
-//!   one cost is given back. How long is overdue, answers tell (RFC 6298), and what is at stake: nobody waits long for
+//!   one cost is given back. Questions that bring nothing, because what they ask for is on its way, become dearer, as
+//!   long as news keep coming. How long is overdue, answers tell (RFC 6298), and what is at stake: nobody waits long for
 //!   little.
 //! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
 //! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
@@ -17,6 +18,7 @@
 
 mod announce;
 mod budget;
+mod experience;
 mod neighbour;
 mod purse;
 #[cfg(test)]
@@ -31,7 +33,8 @@ pub(crate) use purse::Bucket;
 
 use announce::Announce;
 use core::time::Duration;
-use neighbour::Neighbour;
+use experience::Experience;
+use neighbour::{Neighbour, Stake};
 use purse::Purse;
 use rand::Rng;
 use rand::RngExt;
@@ -83,6 +86,7 @@ pub struct Spread {
     neighbours: BTreeMap<RobotId, Neighbour>,
     announce: Announce,
     purse: Purse,
+    experience: Experience,
     answer_max: Duration,
     wake: Instant,
 }
@@ -95,6 +99,7 @@ impl Spread {
             neighbours: BTreeMap::new(),
             announce: Announce::new(have_secs, now),
             purse: Purse::new(QUESTIONS_PER_SEC, QUESTIONS_AT_ONCE, now),
+            experience: Experience::new(),
             answer_max: Duration::from_secs_f64(answer_secs),
             wake: now,
         }
@@ -158,6 +163,9 @@ impl Spread {
         let Some(neighbour) = self.neighbours.get_mut(&peer) else { return };
         self.wake = now;
         neighbour.answered(now, replica.root(), asked, answer);
+        if let Answer::Got { new, .. } = answer {
+            self.experience.answered(new > 0);
+        }
         if matches!(answer, Answer::Got { new, .. } if new >= FAR_APART) {
             self.purse.refill(now);
             self.announce.refill(now);
@@ -167,6 +175,7 @@ impl Spread {
     /// The set of durable facts grew by `new`.
     pub fn on_news(&mut self, now: Instant, new: usize) {
         self.wake = now;
+        self.experience.news(now);
         self.announce.news(now, new, self.neighbours.len());
     }
 
@@ -198,8 +207,8 @@ impl Spread {
         let strangers = self.neighbours.values().filter(|neighbour| neighbour.is_stranger()).count();
         let mut best: Vec<(RobotId, f64)> = Vec::new();
         for (robot, neighbour) in &mut self.neighbours {
-            if let Some(gain) = neighbour.lost() {
-                self.purse.give_back(now, gain);
+            if let Some(Stake { gain, copies }) = neighbour.lost() {
+                self.purse.give_back(now, gain, copies);
             }
             match neighbour.promises(now, replica, (root, count), self.me < *robot, strangers) {
                 Ok(gain) => best.push((*robot, neighbour.hope() * gain)),
@@ -210,7 +219,8 @@ impl Spread {
         if most <= 0.0 {
             return None;
         }
-        let due = self.purse.due(now, most);
+        let copies = self.experience.copies(now, most);
+        let due = self.purse.due(now, most, copies);
         if now < due {
             self.wake = self.wake.min(due);
             return None;
@@ -218,9 +228,9 @@ impl Spread {
         best.retain(|(_, gain)| 2.0 * gain >= most);
         let (peer, _) = best[rng.random_range(0..best.len())];
         let neighbour = self.neighbours.get_mut(&peer)?;
-        self.purse.pay(now, most, 1.0);
+        self.purse.pay(now, most, copies);
         self.wake = now;
-        let have = neighbour.question(now, self.me, replica, most);
+        let have = neighbour.question(now, self.me, replica, Stake { gain: most, copies });
         Some(Step::Ask { peer, have })
     }
 }

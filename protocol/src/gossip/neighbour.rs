@@ -66,12 +66,20 @@ pub(super) struct Neighbour {
 struct Question {
     at: Instant,
     named: bool,
-    /// Facts that it may bring.
-    gain: f64,
+    stake: Stake,
     /// Whether it was already taken for lost.
     lost: bool,
     /// Where its vector began.
     window: Option<FrameId>,
+}
+
+/// What a question may bring, and what it cost.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Stake {
+    /// Facts that it may bring.
+    pub gain: f64,
+    /// How many times the usual it cost.
+    pub copies: f64,
 }
 
 /// Nothing is to be gained while both sides stay as they are.
@@ -118,17 +126,17 @@ impl Neighbour {
         let usual = (self.round_trip + 4 * self.varies).max(PATIENCE_MIN);
         let backoff = 1 << self.given_up.saturating_sub(GIVEN_UP_FREE).min(GIVEN_UP_MAX);
         let question = self.asked?;
-        let worth = PATIENCE_MIN + PATIENCE_PER_FACT.mul_f64(question.gain.min(1e6));
+        let worth = PATIENCE_MIN + PATIENCE_PER_FACT.mul_f64(question.stake.gain.min(1e6));
         let patience = usual.min(worth).saturating_mul(backoff).min(longest.max(PATIENCE_MIN));
         Some(question.at.after(patience)).filter(|ends| now < *ends)
     }
 
-    /// Called when no question keeps others back: what one that is overdue was hoped to bring, once.
-    pub fn lost(&mut self) -> Option<f64> {
+    /// Called when no question keeps others back: what was at stake with one that is overdue, once.
+    pub fn lost(&mut self) -> Option<Stake> {
         let question = self.asked.as_mut().filter(|question| !question.lost)?;
         question.lost = true;
         self.more = false; // Somebody else may do better.
-        Some(question.gain)
+        Some(question.stake)
     }
 
     /// Share of what it promises that may be counted on. Called when no question keeps others back: one that is under way
@@ -183,13 +191,13 @@ impl Neighbour {
         Ok((have.count.saturating_sub(self.compared) as f64 * NEW_TO_US).max(1.0))
     }
 
-    /// The vector to ask it with: of the logs it is known to have more of, else of all. `gain`: what it may bring.
-    pub fn question(&mut self, now: Instant, me: RobotId, replica: &Replica, gain: f64) -> HaveVector {
+    /// The vector to ask it with: of the logs it is known to have more of, else of all.
+    pub fn question(&mut self, now: Instant, me: RobotId, replica: &Replica, stake: Stake) -> HaveVector {
         let named = self.named(replica);
         if self.asked.is_some() {
             self.given_up = self.given_up.saturating_add(1);
         }
-        self.asked = Some(Question { at: now, named: !named.is_empty(), gain, lost: false, window: self.window });
+        self.asked = Some(Question { at: now, named: !named.is_empty(), stake, lost: false, window: self.window });
         if !named.is_empty() {
             return replica.have_named(me, self.listed, named);
         }
@@ -276,13 +284,17 @@ mod tests {
     use crate::replica::testing::replica;
     use crate::wire::samples;
 
+    fn usual(gain: f64) -> Stake {
+        Stake { gain, copies: 1.0 }
+    }
+
     #[test]
     fn patience_follows_the_answers_late_ones_too() {
         let (replica, me) = (replica(), samples::robot(0));
         let mut one = Neighbour::default();
         let longest = Duration::from_secs(10);
         let patience = |one: &mut Neighbour, now: Instant, gain: f64| {
-            one.question(now, me, &replica, gain);
+            one.question(now, me, &replica, usual(gain));
             one.patience_ends(now, longest).unwrap().since(now)
         };
         let mut now = Instant::ZERO;
@@ -316,7 +328,7 @@ mod tests {
         let mut pauses = Vec::new();
         for _ in 0..9 {
             let hope = one.promises(now, &replica, ours, true, 1).unwrap();
-            one.question(now, me, &replica, hope);
+            one.question(now, me, &replica, usual(hope));
             let ends = one.patience_ends(now, longest).unwrap();
             assert_eq!(one.patience_ends(ends, longest), None);
             assert!(one.lost().is_some() && one.lost().is_none(), "given back once");
@@ -334,7 +346,7 @@ mod tests {
         let ours = (replica.root(), replica.count());
         let mut one = Neighbour::default();
         one.heard(Instant::ZERO, HaveRoot { root: [1; 8], count: 50 });
-        one.question(Instant::ZERO, me, &replica, 1.0);
+        one.question(Instant::ZERO, me, &replica, usual(1.0));
         one.answered(Instant::ZERO, ours.0, Instant::ZERO, Answer::Got { new: 5, more: true });
         one.window = Some(samples::frame(0, 1));
         let mut now = Instant::ZERO;
@@ -342,7 +354,7 @@ mod tests {
         for _ in 0..8 {
             assert_eq!(one.promises(now, &replica, ours, true, 1), Ok(f64::from(u32::MAX)), "a tail to resume");
             let before = one.window;
-            one.question(now, me, &replica, 1.0);
+            one.question(now, me, &replica, usual(1.0));
             one.answered(now, ours.0, now, Answer::Postponed);
             assert_eq!(one.window, before);
             let again = now.after(pause);
@@ -351,9 +363,9 @@ mod tests {
             now = again;
             pause = (2 * pause).min(LATER_MAX);
         }
-        one.question(now, me, &replica, 1.0);
+        one.question(now, me, &replica, usual(1.0));
         one.answered(now, ours.0, now, Answer::Got { new: 1, more: true });
-        one.question(now, me, &replica, 1.0);
+        one.question(now, me, &replica, usual(1.0));
         one.answered(now, ours.0, now, Answer::Postponed);
         assert_eq!(one.promises(now, &replica, ours, true, 1), Err(now.after(LATER_MIN)), "it had room meanwhile");
     }

@@ -55,12 +55,12 @@ impl Purse {
         Self(Bucket::new(coins_per_sec, coins_max, now))
     }
 
-    /// When a message about `facts` facts may go out.
-    pub fn due(&self, now: Instant, facts: f64) -> Instant {
-        self.0.due(now, price(facts))
+    /// When a message about `facts` facts may go out that costs this many times the usual.
+    pub fn due(&self, now: Instant, facts: f64, copies: f64) -> Instant {
+        self.0.due(now, copies * price(facts))
     }
 
-    /// When a message may go out that costs this many times the usual; a little later at least.
+    /// The same; a little later at least.
     pub fn due_soon(&self, now: Instant, facts: f64, copies: f64) -> Instant {
         self.0.due(now, copies * price(facts)).max(now.after(WAIT_MIN))
     }
@@ -71,10 +71,10 @@ impl Purse {
         self.0.set(now, left);
     }
 
-    /// A message about `facts` facts was lost: the next costs nothing more.
-    pub fn give_back(&mut self, now: Instant, facts: f64) {
+    /// A message about `facts` facts was lost that cost this many times the usual: the next costs nothing more.
+    pub fn give_back(&mut self, now: Instant, facts: f64, copies: f64) {
         let level = self.0.level(now);
-        self.0.set(now, (level + price(facts)).min(level.max(self.0.full())));
+        self.0.set(now, (level + copies * price(facts)).min(level.max(self.0.full())));
     }
 
     /// Much was moved at once: now the purse holds twice what fills it otherwise.
@@ -96,13 +96,13 @@ mod tests {
     fn what_was_lost_is_given_back_and_not_more() {
         let now = Instant::ZERO;
         let mut purse = Purse::new(1.0, 2.0, now);
-        purse.give_back(now, 1.0);
+        purse.give_back(now, 1.0, 1.0);
         assert_eq!(purse.0.level(now), 2.0, "a full purse stays full");
         purse.pay(now, 1.0, 1.0);
         purse.pay(now, 1.0, 1.0);
-        assert!(purse.due(now, 1.0) > now);
-        purse.give_back(now, 1.0);
-        assert_eq!(purse.due(now, 1.0), now);
+        assert!(purse.due(now, 1.0, 1.0) > now);
+        purse.give_back(now, 1.0, 1.0);
+        assert_eq!(purse.due(now, 1.0, 1.0), now);
         assert_eq!(purse.0.level(now), 1.0);
     }
 
@@ -112,7 +112,7 @@ mod tests {
         let mut purse = Purse::new(1.0, 2.0, now);
         let at_once = |purse: &mut Purse| {
             let mut count = 0;
-            while purse.due(now, 1.0) <= now {
+            while purse.due(now, 1.0, 1.0) <= now {
                 purse.pay(now, 1.0, 1.0);
                 count += 1;
             }

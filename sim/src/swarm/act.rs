@@ -306,7 +306,7 @@ impl<C: Core> Swarm<C> {
                 }
             }
             Output::Run { id, job } => {
-                let nanos = job_nanos(job.kind(), &self.scenario.machine);
+                let nanos = job_nanos(job.kind(), job.size(), &self.scenario.machine);
                 let at = self.robots[robot].work(now, nanos);
                 self.queue.push(at, Event::JobDone { robot, incarnation, id, job: Box::new(job) });
             }
