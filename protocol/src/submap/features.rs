@@ -27,7 +27,9 @@ const FEATURES_MAGIC: [u8; 2] = *b"mf";
 /// The same of landmarks.
 const LANDMARK_KEYPOINTS_MAGIC: [u8; 2] = *b"ml";
 const LANDMARK_FEATURES_MAGIC: [u8; 2] = *b"mL";
-/// Bytes that a keypoint of a surface takes.
+/// Bytes that the descriptor of a keypoint of a surface takes...
+pub const DESCRIPTOR_LEN: usize = PACKED_LEN;
+/// ...and all of it.
 pub const KEYPOINT_LEN: usize = Block::<PACKED_LEN>::POINT_LEN;
 
 /// The described points that a submap's owner offers to others, most important first, in the anchor frame.

@@ -45,7 +45,8 @@ pub(super) fn load(data: &Path, keypoints: usize) -> anyhow::Result<Set> {
         let described = describe(&drawn.submap, &config);
         let describe_s = thread_seconds() - start;
         let name = drawn.submap.index.to_string();
-        Place { name, described, t_world_anchor, thin_s: drawn.thin_s, describe_s, scan: None }
+        let (keyframes, thin_s) = (drawn.submap.keyframes.len(), drawn.thin_s);
+        Place { name, described, t_world_anchor, keyframes, thin_s, describe_s, scan: None }
     };
     let places = way.submaps.into_iter().zip(truth).map(place).collect();
     Ok(Set {

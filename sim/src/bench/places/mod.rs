@@ -55,7 +55,8 @@ pub fn run(options: &Places) -> anyhow::Result<bool> {
             Some(python) => peer::measure(python, options.peer_voxel, &sets, &tried)?,
             None => Vec::new(),
         };
-        let outcome = table::Outcome { seed, sets: &sets, tried: &tried, peers: &peers };
+        let dense = &sets::dense(&options.data, usize::from(options.keypoints), seed)?;
+        let outcome = table::Outcome { seed, sets: &sets, tried: &tried, peers: &peers, dense };
         write!(std::io::stdout().lock(), "{outcome}")?;
         good &= outcome.is_good();
     }

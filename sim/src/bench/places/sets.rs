@@ -13,6 +13,9 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+/// Thins a turn of KITTI's LiDAR to about 20,000 points.
+const DENSE_VOXEL_M: f64 = 0.3;
+
 /// A described submap.
 pub(super) struct Place {
     /// Its number in the set's own counting.
@@ -21,6 +24,8 @@ pub(super) struct Place {
     pub described: Described,
     /// The truth.
     pub t_world_anchor: Se3,
+    /// Keyframes that it is made of.
+    pub keyframes: usize,
     /// Processor time to thin and to describe it, s.
     pub thin_s: f64,
     /// See above.
@@ -62,6 +67,16 @@ pub(super) fn load(data: &Path, keypoints: usize, seed: u64) -> anyhow::Result<V
     let mut maker = Maker { keypoints, rng: ChaCha8Rng::seed_from_u64(seed) };
     let aces = aces::load(data, keypoints)?;
     Ok(vec![maker.seven_scenes(data)?, maker.kitti07(data)?, maker.kitti00(data)?, aces])
+}
+
+/// A whole LiDAR turn thinned less than usual: about 20,000 points.
+///
+/// # Errors
+/// Data that is not there.
+pub(super) fn dense(data: &Path, keypoints: usize, seed: u64) -> anyhow::Result<Place> {
+    let mut maker = Maker { keypoints, rng: ChaCha8Rng::seed_from_u64(seed) };
+    let points = files::points(&data.join("kitti00_scans/000000.bin"), 4)?;
+    Ok(maker.place("dense".to_owned(), DENSE_VOXEL_M, vec![(Se3::identity(), points)])?.0)
 }
 
 struct Maker {
@@ -164,7 +179,8 @@ impl Maker {
         // The builder was told true poses: its anchor's is one of them.
         let t_world_anchor = submap.t_frame_anchor;
         let (thin_s, describe_s) = (thinned - start, done - thinned);
-        Ok((Place { name, described, t_world_anchor, thin_s, describe_s, scan: None }, turn))
+        let keyframes = submap.keyframes.len();
+        Ok((Place { name, described, t_world_anchor, keyframes, thin_s, describe_s, scan: None }, turn))
     }
 
     fn config(&self, voxel_m: f64) -> SubmapConfig {

@@ -3,12 +3,15 @@
 use super::candidates::ranking;
 use super::measure::{At, OVERLAP_FOUND, OVERLAP_NONE, Tried, place};
 use super::peer::Peer;
-use super::sets::Set;
+use super::sets::{Place, Set};
 use core::fmt::{Display, Formatter, Result};
 use merganser_protocol::config::Sensor;
+use merganser_protocol::submap::features::DESCRIPTOR_LEN;
 
 /// Pairs that overlap a little, too little to be sure: by set and names.
 const HARD: [(&str, &str, &str); 2] = [("kitti00", "94", "198"), ("kitti00", "5", "94")];
+/// Processor time to describe a LiDAR keyframe of about 20,000 points at most, ms.
+const DENSE_MS_MAX: f64 = 20.0;
 /// 95 % quantile of χ² with 6 degrees of freedom.
 const CHI2_6_95: f64 = 12.592;
 
@@ -18,6 +21,8 @@ pub(super) struct Outcome<'a> {
     pub sets: &'a [Set],
     pub tried: &'a [Tried],
     pub peers: &'a [Peer],
+    /// A LiDAR turn of about as many points as the goal for describing is stated of.
+    pub dense: &'a Place,
 }
 
 /// Whether a pair is one of those to be refused though they overlap.
@@ -125,13 +130,12 @@ impl Outcome<'_> {
     }
 
     fn candidates(&self, f: &mut Formatter<'_>) -> Result {
-        let lidar: Vec<usize> =
+        let streets: Vec<usize> =
             (0..self.sets.len()).filter(|&k| self.sets[k].places.iter().all(|p| p.scan.is_some())).collect();
-        let (offices, rooms): (Vec<usize>, Vec<usize>) =
-            (0..self.sets.len()).filter(|k| !lidar.contains(k)).partition(|&k| self.sets[k].sensor == Sensor::Laser2d);
+        let each = self.sets.iter().enumerate().map(|(k, set)| (set.name, vec![k]));
         writeln!(f, "candidates  pairs  to find  recall at 100 % precision  precision–recall area (chance)")?;
-        for (name, of) in [("two streets", &lidar), ("one room", &rooms), ("offices", &offices)] {
-            let r = ranking(self.sets, self.tried, of);
+        for (name, of) in each.chain([("all streets", streets)]) {
+            let r = ranking(self.sets, self.tried, &of);
             let all = r.positives + r.negatives;
             writeln!(
                 f,
@@ -146,24 +150,16 @@ impl Outcome<'_> {
     }
 
     fn costs(&self, f: &mut Formatter<'_>) -> Result {
-        writeln!(f, "submaps    points  summary B  keypoints B  extra B  thin ms  describe ms  µs a point")?;
+        writeln!(
+            f,
+            "submaps    points  keyframes  summary B  blob B  of it descriptors B  CPU ms a keyframe: thin  describe  \
+             µs a point"
+        )?;
         for set in self.sets {
-            let of =
-                |value: fn(&super::sets::Place) -> f64| median(&set.places.iter().map(value).collect::<Vec<f64>>());
-            writeln!(
-                f,
-                "{:<9} {:>7.0} {:>10.0} {:>12.0} {:>8} {:>8.1} {:>12.1} {:>11.2}",
-                set.name,
-                of(|p| p.described.features.len() as f64),
-                of(|p| p.described.summary.encode().len() as f64),
-                of(|p| p.described.keypoints.encode().len() as f64),
-                0,
-                of(|p| p.thin_s * 1e3),
-                of(|p| p.describe_s * 1e3),
-                of(|p| p.describe_s * 1e6 / p.described.features.len() as f64),
-            )?;
+            cost(f, set.name, &set.places.iter().collect::<Vec<_>>())?;
         }
-        Ok(())
+        cost(f, "dense", &[self.dense])?;
+        writeln!(f, "dense: a LiDAR turn thinned to about 20,000 points; goal {DENSE_MS_MAX:.0} ms to describe it")
     }
 
     fn compared(&self, f: &mut Formatter<'_>) -> Result {
@@ -174,7 +170,7 @@ impl Outcome<'_> {
         for peer in self.peers {
             let (a, b) = peer.pair;
             let name = format!("{} {}–{}", self.sets[a.0].name, place(self.sets, a).name, place(self.sets, b).name);
-            let Some(ours) = self.tried.iter().find(|t| (t.their, t.mine) == (a, b)) else { continue };
+            let Some(ours) = self.ours(peer) else { continue };
             let error = |error: Option<(f64, f64)>| {
                 error.map_or_else(|| format!("{:>10} {:>7}", "refused", ""), |(deg, m)| format!("{deg:>10.2} {m:>7.3}"))
             };
@@ -183,12 +179,45 @@ impl Outcome<'_> {
                 f,
                 "{name:<15} {} {:>8.0} | {said:>31} {:>8.0} {:>8.0}",
                 error(ours.error),
-                self.both_described(a, b) * 1e3 + ours.seconds * 1e3,
+                self.cpu_s(ours) * 1e3,
                 peer.cpu_s * 1e3,
                 peer.wall_s * 1e3,
             )?;
         }
-        Ok(())
+        let pairs: Vec<_> = self.peers.iter().filter_map(|peer| Some((self.ours(peer)?, peer))).collect();
+        let to_find: Vec<_> = pairs.iter().filter(|(t, _)| !is_hard(self.sets, t)).collect();
+        let rule = |t: &Tried| &self.sets[t.their.0];
+        let is_right = |t: &Tried, peer: &Peer| {
+            peer.valid && peer.error.0 < rule(t).rotation_deg && peer.error.1 < rule(t).translation_m
+        };
+        let theirs = to_find.iter().filter(|(t, peer)| is_right(t, peer));
+        // Where both found the pair.
+        let both: Vec<_> =
+            theirs.clone().filter_map(|(t, peer)| Some((t.error.filter(|_| t.is_right)?, peer.error))).collect();
+        let of = |value: fn(&((f64, f64), (f64, f64))) -> f64| median(&both.iter().map(value).collect::<Vec<_>>());
+        writeln!(
+            f,
+            "to find {}: ours {}, theirs {}; median error where both do: ours {:.2}° and {:.3} m, theirs {:.2}° and \
+             {:.3} m; processor time, median ratio theirs to ours: {:.1}",
+            to_find.len(),
+            to_find.iter().filter(|(t, _)| t.is_right).count(),
+            theirs.count(),
+            of(|b| b.0.0),
+            of(|b| b.0.1),
+            of(|b| b.1.0),
+            of(|b| b.1.1),
+            median(&pairs.iter().map(|(t, peer)| peer.cpu_s / self.cpu_s(t)).collect::<Vec<_>>())
+        )
+    }
+
+    /// The same pair, by us.
+    fn ours(&self, peer: &Peer) -> Option<&Tried> {
+        self.tried.iter().find(|t| (t.their, t.mine) == peer.pair)
+    }
+
+    /// Processor time from two raw clouds to an answer, s.
+    fn cpu_s(&self, t: &Tried) -> f64 {
+        self.both_described(t.their, t.mine) + t.seconds
     }
 
     /// Time from two raw clouds to two descriptions, s.
@@ -205,6 +234,22 @@ impl Display for Outcome<'_> {
         self.costs(f)?;
         self.compared(f)
     }
+}
+
+fn cost(f: &mut Formatter<'_>, name: &str, places: &[&Place]) -> Result {
+    let of = |value: fn(&Place) -> f64| median(&places.iter().map(|place| value(place)).collect::<Vec<f64>>());
+    writeln!(
+        f,
+        "{name:<9} {:>7.0} {:>10.0} {:>10.0} {:>7.0} {:>20.0} {:>24.1} {:>9.1} {:>11.2}",
+        of(|p| p.described.features.len() as f64),
+        of(|p| p.keyframes as f64),
+        of(|p| p.described.summary.encode().len() as f64),
+        of(|p| p.described.keypoints.encode().len() as f64),
+        of(|p| (p.described.keypoints.len() * DESCRIPTOR_LEN) as f64),
+        of(|p| p.thin_s * 1e3 / p.keyframes as f64),
+        of(|p| p.describe_s * 1e3 / p.keyframes as f64),
+        of(|p| p.describe_s * 1e6 / p.described.features.len() as f64),
+    )
 }
 
 fn percent(part: usize, of: usize) -> f64 {
