@@ -9,7 +9,7 @@ use crate::time::Instant;
 use core::time::Duration;
 
 /// News that are on their way have come after so long.
-const ON_THEIR_WAY: Duration = Duration::from_secs(1);
+const ON_THEIR_WAY: Duration = Duration::from_millis(300);
 /// What the last answer weighs against those before it.
 const NOVELTY: f64 = 0.25;
 /// No question is dearer than so many of those that bring something: a fact that was lost waits no longer for it.
@@ -65,8 +65,8 @@ mod tests {
         }
         assert_eq!(before, COPIES_MAX);
         assert_eq!(experience.copies(secs(5.0), FAR_APART as f64), 1.0, "much is worth it");
-        assert!(experience.copies(secs(5.99), 1.0) > 1.0);
-        assert_eq!(experience.copies(secs(6.0), 1.0), 1.0, "what is still different was lost");
+        assert!(experience.copies(secs(5.29), 1.0) > 1.0);
+        assert_eq!(experience.copies(secs(5.3), 1.0), 1.0, "what is still different was lost");
         experience.answered(true);
         assert!(experience.copies(secs(5.0), 1.0) < 4.1);
     }
