@@ -49,7 +49,7 @@ pub struct ChordalOutcome {
     pub cost: f64,
     /// Iterations used.
     pub iterations: usize,
-    /// Whether the last step was negligible.
+    /// Whether the last step was negligible, or the next would be.
     pub converged: bool,
     /// Whether that minimum is the global one.
     pub certificate: Certificate,
@@ -64,7 +64,7 @@ pub struct Minimised {
     pub chi2: f64,
     /// Iterations used.
     pub iterations: usize,
-    /// Whether the last step was negligible.
+    /// Whether the last step was negligible, or the next would be.
     pub converged: bool,
 }
 
