@@ -241,7 +241,7 @@ impl Terms for Model {
                 sum.rhs(i, (-term.gradient_i).iter());
             }
             if let Some((i, j)) = i.zip(j) {
-                sum.block(i, j, &term.ij);
+                sum.block(j, i, &term.ji);
             }
             return;
         }
