@@ -128,17 +128,20 @@ impl Graph {
     pub fn components(
         nodes: &BTreeSet<SubmapId>,
         unknown_scale: &BTreeSet<FrameId>,
-        mut factors: Vec<Factor>,
+        factors: Vec<Factor>,
     ) -> Result<Vec<Self>, GraphError> {
-        factors.sort_by(canonical);
+        // Their numbers are sorted, because they themselves are large.
+        let mut order: Vec<usize> = (0..factors.len()).collect();
+        order.sort_by(|&a, &b| canonical(&factors[a], &factors[b]));
         let index: BTreeMap<SubmapId, usize> = nodes.iter().enumerate().map(|(k, &id)| (id, k)).collect();
         let mut sets = Disjoint::new(nodes.len());
         let mut edges = Vec::with_capacity(factors.len());
-        for factor in factors {
+        for factor in order.into_iter().map(|k| factors[k]) {
             let edge = Edge::new(factor, |id| index.get(&id).copied(), unknown_scale)?;
             sets.join(edge.i, edge.j);
             edges.push(edge);
         }
+        drop(factors);
         let mut members: BTreeMap<usize, Vec<SubmapId>> = BTreeMap::new();
         let mut local = Vec::with_capacity(nodes.len());
         for (k, &id) in nodes.iter().enumerate() {
@@ -147,6 +150,9 @@ impl Graph {
             list.push(id);
         }
         let mut edges_of: BTreeMap<usize, Vec<Edge>> = BTreeMap::new();
+        if let Some(&root) = members.keys().next().filter(|_| members.len() == 1) {
+            edges_of.insert(root, core::mem::take(&mut edges));
+        }
         for mut edge in edges {
             let root = sets.root(edge.i);
             (edge.i, edge.j) = (local[edge.i], local[edge.j]);
@@ -246,7 +252,13 @@ impl Edge {
     /// The weighted square of the residual.
     pub(super) fn chi2(&self, values: &[Sim3]) -> f64 {
         let r = self.residual(values);
-        r.dot(&(self.information * r))
+        match &self.factor.t_i_j {
+            Relative::Metric(_) => {
+                let r = r.fixed_rows::<6>(0);
+                r.dot(&(self.information.fixed_view::<6, 6>(0, 0) * r))
+            }
+            Relative::Similarity(_) => r.dot(&(self.information * r)),
+        }
     }
 
     pub(super) fn linearise(&self, values: &[Sim3]) -> Linearised {
@@ -289,7 +301,9 @@ fn linearise_rigid(measured: &Se3, predicted: &Se3) -> Linearised {
 
 /// The information of a measurement, its certainty bounded by [`VARIANCE_MIN`].
 fn information_of<const N: usize>(covariance: &Covariance<N>) -> SMatrix<f64, N, N> {
-    Covariance::new_or_wider(covariance.matrix() + SMatrix::identity() * VARIANCE_MIN).information()
+    let bounded = covariance.matrix() + SMatrix::identity() * VARIANCE_MIN;
+    // A covariance remains one; only rounding can say otherwise.
+    bounded.cholesky().map_or_else(|| Covariance::new_or_wider(bounded).information(), |c| c.inverse())
 }
 
 /// A rigid tangent vector as one of SIM(3).
