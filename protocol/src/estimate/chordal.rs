@@ -51,7 +51,7 @@ pub struct ChordalSolution {
     pub cost: f64,
     /// Iterations used.
     pub iterations: usize,
-    /// Whether the last step was negligible.
+    /// Whether the last step was negligible, or the next would be.
     pub converged: bool,
 }
 
@@ -66,8 +66,9 @@ impl ChordalGraph {
     /// # Errors
     /// [`SolveError::Underconstrained`] if the graph is not connected.
     pub fn relaxed(&self) -> Result<Vec<Se3>, SolveError> {
-        let rotations = self.relaxed_rotations()?;
-        let translations = self.translations(&rotations)?;
+        let [of_rotations, of_translations] = self.patterns([3, 1])?;
+        let rotations = self.relaxed_rotations(&of_rotations)?;
+        let translations = self.translations(&of_translations, &rotations)?;
         Ok(rotations.into_iter().zip(translations).map(|(r, t)| Se3::new(So3::from_matrix(&r), t)).collect())
     }
 
@@ -91,8 +92,7 @@ impl ChordalGraph {
 
     /// Minimises `Σ κ‖R_j − R_i R_ij‖²` over all matrices, then projects on the rotations. Each row `y` of the matrices
     /// is a problem of its own, `Σ κ‖y_j − R_ijᵀ y_i‖²`, with the same normal matrix.
-    fn relaxed_rotations(&self) -> Result<Vec<Matrix3<f64>>, SolveError> {
-        let pattern = self.pattern(3)?;
+    fn relaxed_rotations(&self, pattern: &BlockPattern) -> Result<Vec<Matrix3<f64>>, SolveError> {
         let mut h = vec![0.0; pattern.value_count()];
         let mut b = vec![0.0; 3 * pattern.scalars()];
         for edge in &self.edges {
@@ -127,8 +127,11 @@ impl ChordalGraph {
     }
 
     /// Minimises `Σ τ‖t_j − t_i − R_i t_ij‖²`.
-    fn translations(&self, rotations: &[Matrix3<f64>]) -> Result<Vec<Vector3<f64>>, SolveError> {
-        let pattern = self.pattern(1)?;
+    fn translations(
+        &self,
+        pattern: &BlockPattern,
+        rotations: &[Matrix3<f64>],
+    ) -> Result<Vec<Vector3<f64>>, SolveError> {
         let mut h = vec![0.0; pattern.value_count()];
         let mut b = vec![0.0; 3 * pattern.scalars()];
         for edge in &self.edges {
@@ -153,10 +156,11 @@ impl ChordalGraph {
         Ok((0..self.nodes).map(|node| if node == 0 { Vector3::zeros() } else { of(node) }).collect())
     }
 
-    /// The pattern of `size` scalars a node without the first.
-    fn pattern(&self, size: usize) -> Result<BlockPattern, SolveError> {
+    /// The patterns of so many scalars a node without the first.
+    fn patterns<const N: usize>(&self, scalars: [usize; N]) -> Result<[BlockPattern; N], SolveError> {
         let free = self.edges.iter().filter(|e| e.i > 0 && e.j > 0);
-        BlockPattern::new(&vec![size; self.nodes.saturating_sub(1)], free.map(|e| (e.i - 1, e.j - 1)))
+        let sizes = scalars.map(|size| vec![size; self.nodes.saturating_sub(1)]);
+        BlockPattern::of_sizes(sizes.each_ref().map(Vec::as_slice), free.map(|e| (e.i - 1, e.j - 1)))
     }
 }
 
@@ -198,7 +202,7 @@ struct Chordal<'a> {
 
 impl<'a> Chordal<'a> {
     fn new(graph: &'a ChordalGraph) -> Result<Self, SolveError> {
-        let pattern = graph.pattern(6)?;
+        let [pattern] = graph.patterns([6])?;
         let slot = |a: usize, b: usize| (a > 0 && b > 0).then(|| pattern.slot(a - 1, b - 1));
         let slots = graph.edges.iter().map(|e| [slot(e.i, e.i), slot(e.i, e.j), slot(e.j, e.j)]).collect();
         Ok(Self { graph, slots, pattern, exact: false })

@@ -15,7 +15,8 @@ pub(in crate::estimate) struct Factor {
 /// Memory that factorisations share: fresh pages cost more than the arithmetic of small fronts.
 #[derive(Default)]
 pub(in crate::estimate) struct Workspace {
-    /// Updates that their parents have not taken up yet, the latest last.
+    /// Updates that their parents have not taken up yet, the latest last; then what is left of earlier ones. Of each, a
+    /// square, the lower triangle counts.
     updates: Vec<f64>,
     scratch: Scratch,
 }
@@ -35,13 +36,18 @@ impl BlockPattern {
     pub(in crate::estimate) fn factorise(&self, h: Vec<f64>, space: &mut Workspace) -> Result<Factor, SolveError> {
         let mut values = h;
         let Workspace { updates, scratch } = space;
-        updates.clear();
+        let mut top = 0;
         for front in &self.fronts {
             // In postorder the children's updates lie on top, one after the other.
+            let depth = front.depth();
             let given: usize = front.children.iter().map(|&child| self.fronts[child].depth().pow(2)).sum();
-            let (base, size) = (updates.len() - given, front.depth().pow(2));
-            updates.resize(base + given + size, 0.0);
-            let (children, update) = updates[base..].split_at_mut(given);
+            let (base, size) = (top - given, depth.pow(2));
+            top = base + size;
+            if updates.len() < top + given {
+                updates.resize(top + given, 0.0);
+            }
+            let (children, update) = updates[base..top + given].split_at_mut(given);
+            (0..depth).for_each(|c| update[c * depth + c..(c + 1) * depth].fill(0.0));
             let panel = &mut values[front.offset..front.offset + front.height * front.pivots.len()];
             let mut rest = &*children;
             for child in front.children.iter().map(|&child| &self.fronts[child]) {
@@ -54,10 +60,16 @@ impl BlockPattern {
                 variable: self.variable_of(front.pivots.start + index),
             })?;
             panel.subtract_square(update);
-            updates.copy_within(base + given.., base);
-            updates.truncate(base + size);
+            if given > 0 {
+                for c in 0..depth {
+                    let column = base + c * depth;
+                    updates.copy_within(column + given + c..column + given + depth, column + c);
+                }
+            }
         }
-        if values.iter().all(|x| x.is_finite()) { Ok(Factor { values }) } else { Err(SolveError::NotFinite) }
+        // Without a way out at the first, which would hold up the processor's vector units.
+        let is_finite = values.iter().fold(true, |so_far, x| so_far & x.is_finite());
+        if is_finite { Ok(Factor { values }) } else { Err(SolveError::NotFinite) }
     }
 
     /// Solves `L Lᵀ x = b` in place for the right-hand sides that follow one another in `b`.

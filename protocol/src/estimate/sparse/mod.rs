@@ -81,8 +81,17 @@ pub(super) struct Slot {
 impl BlockPattern {
     /// Analyses the pattern of `sizes.len()` variables of which those in each pair are coupled.
     pub(super) fn new(sizes: &[usize], pairs: impl IntoIterator<Item = (usize, usize)>) -> Result<Self, SolveError> {
-        let n = sizes.len();
-        let mut below: Vec<Vec<usize>> = vec![Vec::new(); n];
+        Self::of_sizes([sizes], pairs).map(|[only]| only)
+    }
+
+    /// The patterns of equally many variables of several sizes, coupled alike. They are analysed once, for the first
+    /// sizes: the fill, by variable, is the same for all.
+    pub(super) fn of_sizes<const N: usize>(
+        sizes: [&[usize]; N],
+        pairs: impl IntoIterator<Item = (usize, usize)>,
+    ) -> Result<[Self; N], SolveError> {
+        let first = sizes.first().copied().unwrap_or_default();
+        let mut below: Vec<Vec<usize>> = vec![Vec::new(); first.len()];
         for (a, b) in pairs {
             if a != b {
                 below[a.max(b)].push(a.min(b));
@@ -92,21 +101,22 @@ impl BlockPattern {
             rows.sort_unstable();
             rows.dedup();
         }
-        Ok(Self::of(sizes, order::analyse(sizes, &below)?))
+        let elimination = order::analyse(first, &below)?;
+        Ok(sizes.map(|sizes| Self::of(sizes, &elimination)))
     }
 
-    fn of(sizes: &[usize], Elimination { order, supernodes }: Elimination) -> Self {
+    fn of(sizes: &[usize], Elimination { order, supernodes }: &Elimination) -> Self {
         let mut scalar_of_place = Vec::with_capacity(order.len() + 1);
         scalar_of_place.push(0);
         let (mut starts, mut front_of, mut scalars) = (vec![0; order.len()], vec![0; order.len()], 0);
-        for &variable in &order {
+        for &variable in order {
             starts[variable] = scalars;
             scalars += sizes[variable];
             scalar_of_place.push(scalars);
         }
         let mut value_count = 0;
         let mut fronts: Vec<Front> = Vec::with_capacity(supernodes.len());
-        for (k, node) in supernodes.into_iter().enumerate() {
+        for (k, node) in supernodes.iter().enumerate() {
             order[node.pivots.clone()].iter().for_each(|&variable| front_of[variable] = k);
             let pivots = scalar_of_place[node.pivots.start]..scalar_of_place[node.pivots.end];
             let below = runs(node.below.iter().map(|&place| scalar_of_place[place]..scalar_of_place[place + 1]));
@@ -121,7 +131,7 @@ impl BlockPattern {
             fronts[k].into_parent = fronts[k].pieces_in(0, &fronts[parent]);
             fronts[parent].children.push(k);
         }
-        Self { starts, order, front_of, fronts, scalars, value_count }
+        Self { starts, order: order.clone(), front_of, fronts, scalars, value_count }
     }
 
     /// Scalars in all.

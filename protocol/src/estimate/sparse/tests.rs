@@ -71,6 +71,38 @@ proptest! {
 }
 
 #[test]
+fn what_another_factorisation_left_in_memory_does_not_matter() {
+    let (small, large) = (Case::new(8, 20, 30), Case::new(10, 40, 60));
+    let fresh = |case: &Case| case.pattern.factorise(case.values.clone(), &mut Workspace::default()).unwrap().values;
+    let space = &mut Workspace::default();
+    let broken = large.values.iter().map(|_| f64::NAN).collect();
+    assert!(large.pattern.factorise(broken, space).is_err());
+    for case in [&large, &small, &large] {
+        assert_eq!(case.pattern.factorise(case.values.clone(), space).unwrap().values, fresh(case));
+    }
+}
+
+#[test]
+fn variables_of_other_sizes_share_the_analysis() {
+    let case = Case::new(5, 30, 40);
+    let pairs = (1..30).map(|v| (v - 1, v)).chain([(0, 29), (4, 17), (9, 21)]);
+    let [_, of_one] = BlockPattern::of_sizes([&case.sizes, &[1; 30]], pairs.clone()).unwrap();
+    let (mut values, mut dense) = (vec![0.0; of_one.value_count()], DMatrix::zeros(30, 30));
+    let mut add = |a: usize, b: usize, x: f64| {
+        BlockPattern::add(&mut values, of_one.slot(a, b), &nalgebra::Matrix1::new(x));
+        dense[(of_one.start(a), of_one.start(b))] = x;
+        dense[(of_one.start(b), of_one.start(a))] = x;
+    };
+    (0..30).for_each(|v| add(v, v, 8.0));
+    pairs.for_each(|(a, b)| add(a, b, -1.0));
+    let factor = of_one.factorise(values, &mut Workspace::default()).unwrap();
+    let b = DVector::from_fn(30, |r, _| (r as f64).cos());
+    let mut x = b.as_slice().to_vec();
+    of_one.solve(&factor, &mut x);
+    assert!((dense * DVector::from_vec(x) - b).amax() < 1e-12);
+}
+
+#[test]
 fn the_diagonal_is_where_it_is_said_to_be() {
     let case = Case::new(7, 30, 40);
     let got: Vec<f64> = case.pattern.diagonal().map(|at| case.values[at]).collect();
