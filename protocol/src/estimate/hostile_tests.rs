@@ -3,6 +3,7 @@
 use super::intake::{SIGMA_ROTATION_MAX, SIGMA_TRANSLATION_MAX};
 use super::joint::*;
 use super::position::{SeenPoint, StatedPoint};
+use super::solve::SolveError;
 use super::test_graphs::*;
 use super::test_world::*;
 use crate::config::EstimateConfig;
@@ -11,6 +12,7 @@ use crate::ids::EntryId;
 use crate::wire::fact::ScaleKind;
 use nalgebra::Vector3;
 use proptest::prelude::*;
+use rand::RngExt;
 use rand::seq::SliceRandom;
 
 #[test]
@@ -169,4 +171,44 @@ fn extreme_covariances_of_one_robot_do_not_part_the_others() {
             assert_eq!(map.nodes, 24 + kept, "{rho} {phi}");
         }
     }
+}
+
+/// A robot that ties everything of its own to everything costs the swarm its own loops and merges, and nothing else.
+#[test]
+fn a_robot_that_is_tied_all_over_is_left_out_and_it_is_said_why() {
+    const ANCHORS: usize = 4_000;
+    let rng = &mut rng(77);
+    let mut world = World::new(rng, 3, ANCHORS, true);
+    world.align(rng, frame(0), frame(2), 5, true);
+    world.align(rng, frame(0), frame(1), 5, true);
+    for _ in 0..5 * ANCHORS {
+        let (i, j) = (rng.random_range(0..ANCHORS), rng.random_range(0..ANCHORS));
+        if i != j {
+            let t = world.measure(None, submap(1, i), submap(1, j));
+            world.state(submap(1, i), submap(1, j), t);
+        }
+    }
+    let map = world.solve();
+    let mut reasons = std::collections::BTreeMap::new();
+    for edge in map.edges() {
+        let of_one = [edge.measurement.i.frame, edge.measurement.j.frame].contains(&frame(1));
+        let why = match edge.unused {
+            None => "used",
+            Some(Unused::Failed(SolveError::TooDense { .. })) => "too dense",
+            Some(Unused::RepeatsPair(_)) => "repeats",
+            Some(_) => "otherwise",
+        };
+        *reasons.entry((of_one, why)).or_insert(0) += 1;
+    }
+    println!("{reasons:?}");
+    let dense = map.edges().iter().filter_map(|e| e.unused).find(|why| matches!(why, Unused::Failed(_))).unwrap();
+    assert!(dense.to_string().contains("too densely tied"), "{dense}");
+    assert!(
+        matches!(dense, Unused::Failed(SolveError::TooDense { bytes, limit: MAP_BYTES_MAX }) if bytes > MAP_BYTES_MAX)
+    );
+    assert_eq!(reasons.get(&(true, "used")), None);
+    assert_eq!(reasons.get(&(false, "too dense")), None);
+    assert!(reasons[&(true, "too dense")] > 19_000 && reasons[&(false, "used")] > 3, "{reasons:?}");
+    assert!(map.frame(frame(0), frame(2)).is_some() && map.frame(frame(0), frame(1)).is_none());
+    assert!(map.converged && map.anchor(frame(1), submap(1, ANCHORS - 1)).is_some());
 }

@@ -8,6 +8,7 @@ use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
 use super::position::{DIMENSION, StatedPoint};
 use super::reweight::CHI2_999;
+use super::solve::SolveError;
 use super::trajectory::Trajectory;
 use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative, So3};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -135,17 +136,22 @@ impl Intake {
         self.edges.iter_mut().find(is_it).map(|e| e.refuse(reason)).is_some()
     }
 
-    /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst; whether any
-    /// counted until now.
-    pub(super) fn isolate_worst(&mut self, frames: &BTreeSet<FrameId>, reason: Unused) -> bool {
+    /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst, or, where there
+    /// is too little memory, of the one with the most edges; whether any counted until now.
+    pub(super) fn isolate_worst(&mut self, frames: &BTreeSet<FrameId>, error: SolveError) -> bool {
         let counts =
             |e: &EdgeEstimate, f: FrameId| e.is_used() && [e.measurement.i.frame, e.measurement.j.frame].contains(&f);
         let tied = frames.iter().filter(|&&f| self.edges.iter().any(|e| counts(e, f)));
         let spread = |f: &FrameId| self.chains.get(f).map_or(f64::INFINITY, Chain::spread);
-        let Some(&worst) = tied.max_by(|x, y| spread(x).total_cmp(&spread(y))) else { return false };
+        let ties = |f: &FrameId| self.edges.iter().filter(|e| counts(e, *f)).count();
+        let worst = match error {
+            SolveError::TooDense { .. } | SolveError::OutOfMemory => tied.max_by_key(|f| ties(f)),
+            _ => tied.max_by(|x, y| spread(x).total_cmp(&spread(y))),
+        };
+        let Some(&worst) = worst else { return false };
         let mut any = false;
         for edge in self.edges.iter_mut().filter(|e| counts(e, worst)) {
-            edge.refuse(reason);
+            edge.refuse(Unused::Failed(error));
             any = true;
         }
         any

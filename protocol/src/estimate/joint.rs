@@ -16,7 +16,7 @@ use super::optimality::Optimality;
 use super::pairs::{self, Pair};
 use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
-use super::solve::{Solution, SolveError, solve};
+use super::solve::{Solution, SolveError, solve_within};
 use crate::config::EstimateConfig;
 use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -27,6 +27,10 @@ use thiserror::Error;
 
 /// Rounds in which the map lets in what agrees with it: each makes it surer of the next.
 const ADMISSIONS_MAX: usize = 4;
+
+/// Bytes that a component of the map may take while it is solved: what robots have, and half of what a graph of one's own
+/// may take. Whoever sends a map that takes more has his frame left out.
+pub const MAP_BYTES_MAX: u64 = 2 << 30;
 
 /// A frame's own trajectory of anchors.
 #[derive(Clone, Debug, PartialEq)]
@@ -242,7 +246,7 @@ impl Map {
                         solutions.push((frames, Some(solution)));
                     }
                     Err(error) => {
-                        changed |= intake.isolate_worst(&frames, Unused::Failed(error));
+                        changed |= intake.isolate_worst(&frames, error);
                         solutions.push((frames, None));
                     }
                 }
@@ -283,7 +287,7 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
                 let place = |id: &SubmapId| start.get(id).or_else(|| start.get(&distortion::anchor_of(*id))).copied();
                 let start = graph.nodes().iter().map(|id| place(id).unwrap_or_else(Sim3::identity));
                 let start = start.collect();
-                solve(graph, start, iterations_max)
+                solve_within(graph, start, iterations_max, MAP_BYTES_MAX)
             }
             // Intake admits only what a graph accepts, and a chain is connected.
             _ => Err(SolveError::NotFinite),

@@ -5,7 +5,7 @@
 //! factorisation are made once.
 
 use super::solve::SolveError;
-use super::sparse::{BlockPattern, Factor, Workspace};
+use super::sparse::{BlockPattern, Factor, Workspace, zeroed};
 
 /// Stop when a step promises to lower the cost by less than this share of (1 + cost), or when the next one would: of a
 /// χ², a millionth of a standard deviation.
@@ -178,17 +178,19 @@ impl Normal {
     }
 
     /// `H` and `g` at a point.
-    pub(super) fn at<O: Objective>(&mut self, objective: &O, values: &O::Values) {
-        self.h.clear();
-        self.h.resize(objective.pattern().value_count(), 0.0);
-        self.g.clear();
-        self.g.resize(objective.pattern().scalars(), 0.0);
+    ///
+    /// # Errors
+    /// [`SolveError::OutOfMemory`].
+    pub(super) fn at<O: Objective>(&mut self, objective: &O, values: &O::Values) -> Result<(), SolveError> {
+        zeroed(&mut self.h, objective.pattern().value_count())?;
+        zeroed(&mut self.g, objective.pattern().scalars())?;
         objective.linearise(values, self);
+        Ok(())
     }
 
     /// Solves `(H + μ diag H) δ = −g` at a point.
     fn step<O: Objective>(&mut self, objective: &O, values: &O::Values, damping: f64) -> Result<Step, SolveError> {
-        self.at(objective, values);
+        self.at(objective, values)?;
         let pattern = objective.pattern();
         let mut h = core::mem::take(&mut self.h);
         let mut damped = Vec::new();

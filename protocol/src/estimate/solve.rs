@@ -11,6 +11,8 @@ use nalgebra::{Matrix3, Matrix6, SMatrix, Vector6};
 use std::sync::Arc;
 use thiserror::Error;
 
+pub use super::sparse::FACTOR_BYTES_MAX;
+
 /// Why a component could not be solved.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
 pub enum SolveError {
@@ -31,8 +33,22 @@ pub enum SolveError {
         /// Poses given.
         got: usize,
     },
+    /// So much is tied to so much that the factorisation would outgrow its limit
+    /// ([`FACTOR_BYTES_MAX`]). Nothing was allocated.
+    #[error(
+        "too densely tied: the factorisation takes at least {} MiB, {} are allowed; leave out measurements between \
+         far parts, or solve the parts by themselves",
+        .bytes.div_ceil(1 << 20),
+        .limit >> 20
+    )]
+    TooDense {
+        /// Bytes that it takes at least.
+        bytes: u64,
+        /// Bytes that it may take.
+        limit: u64,
+    },
     /// Memory for the factorisation could not be had.
-    #[error("not enough memory for the factorisation")]
+    #[error("not enough memory for the factorisation; free some, or solve fewer poses at a time")]
     OutOfMemory,
 }
 
@@ -84,7 +100,7 @@ pub struct ChiSquaredMinimum {
 /// As [`solve`], but a direction that no measurement determines may pass unseen.
 pub fn minimum(graph: &Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<ChiSquaredMinimum, SolveError> {
     expect_start(graph, &start)?;
-    let found = minimise(&System::new(graph)?, start, iterations_max)?;
+    let found = minimise(&System::new(graph, FACTOR_BYTES_MAX)?, start, iterations_max)?;
     let (chi2, iterations, converged) = (found.cost, found.iterations, found.converged);
     Ok(ChiSquaredMinimum { values: found.values, chi2, iterations, converged })
 }
@@ -100,10 +116,23 @@ fn expect_start(graph: &Graph, start: &[Sim3]) -> Result<(), SolveError> {
 /// # Errors
 /// [`SolveError`]; running out of iterations is no error but `converged = false`.
 pub fn solve(graph: Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<Solution, SolveError> {
+    solve_within(graph, start, iterations_max, FACTOR_BYTES_MAX)
+}
+
+/// [`solve`] with a limit of one's own in place of [`FACTOR_BYTES_MAX`].
+///
+/// # Errors
+/// As [`solve`].
+pub fn solve_within(
+    graph: Graph,
+    start: Vec<Sim3>,
+    iterations_max: usize,
+    bytes_max: u64,
+) -> Result<Solution, SolveError> {
     expect_start(&graph, &start)?;
-    let system = System::new(&graph)?;
+    let system = System::new(&graph, bytes_max)?;
     let Minimum { values, cost: chi2, iterations, converged, mut normal } = minimise(&system, start, iterations_max)?;
-    normal.at(&system, &values);
+    normal.at(&system, &values)?;
     let factor = normal.factorised(&system.pattern)?;
     let residuals: usize = graph.edges().iter().map(Edge::dimension).sum();
     let dof = residuals.saturating_sub(system.pattern.scalars());
@@ -144,14 +173,14 @@ struct Rigid {
 }
 
 impl<'a> System<'a> {
-    fn new(graph: &'a Graph) -> Result<Self, SolveError> {
+    fn new(graph: &'a Graph, bytes_max: u64) -> Result<Self, SolveError> {
         let parts: Vec<_> = graph.edges().iter().map(|e| variables_of(graph, e)).collect();
         let mut sizes = vec![6; graph.nodes().len().saturating_sub(1)];
         sizes.resize(sizes.len() + graph.scale_count(), 1);
         let pairs = parts
             .iter()
             .flat_map(|list| list.iter().enumerate().flat_map(move |(k, a)| list[k..].iter().map(move |b| (a.0, b.0))));
-        let pattern = BlockPattern::new(&sizes, pairs)?;
+        let [pattern] = BlockPattern::within([&sizes], pairs, bytes_max)?;
         let terms = parts.into_iter().map(|parts| Terms::new(parts, &pattern)).collect();
         Ok(Self { graph, pattern, terms })
     }

@@ -2,11 +2,12 @@
 
 use super::graph::{Factor, Graph, GraphError, Label};
 use super::reweight::{LeftOut, leave_one_out};
-use super::solve::{Solution, SolveError, solve};
+use super::solve::{FACTOR_BYTES_MAX, Solution, SolveError, minimum, solve};
 use super::test_graphs::*;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
 use crate::ids::SubmapId;
 use nalgebra::{SMatrix, Vector3};
+use rand::RngExt;
 use rand::seq::SliceRandom;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -331,4 +332,25 @@ fn leave_one_out_equals_the_innovation_against_the_map_without_the_factor() {
     let edge = with.graph().edges().iter().find(|e| e.factor.label == tested.label).unwrap();
     let LeftOut { chi2: got, dof, .. } = leave_one_out(&with, &with.selected_inverse(), edge).unwrap();
     assert!(dof == 6 && (got / want - 1.0).abs() < 0.02, "{got} {want}");
+}
+
+/// Three measurements a pose, at random, leave nothing sparse: dense, the factor of 5,000 poses takes 7 GB.
+#[test]
+fn a_graph_that_is_tied_all_over_is_refused_before_it_takes_memory() {
+    let (rng, poses) = (&mut rng(1), 5_000);
+    let t_i_j = Relative::Metric(PoseWithCovariance { pose: Se3::identity(), covariance: sigmas(0.1, 0.1) });
+    let factor = |(i, j): (usize, usize)| {
+        let (i, j) = (submap(0, i), submap(0, j));
+        Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 }
+    };
+    let chain = (1..poses).map(|k| (k - 1, k)).collect::<Vec<_>>();
+    let random = (0..3 * poses).map(|_| (rng.random_range(0..poses), rng.random_range(0..poses)));
+    let factors = chain.into_iter().chain(random).filter(|(i, j)| i != j).map(factor).collect();
+    let nodes = (0..poses).map(|k| submap(0, k)).collect();
+    let graph = Graph::components(&nodes, &BTreeSet::new(), factors).unwrap().remove(0);
+    let start = vec![Sim3::identity(); poses];
+    let error = solve(graph.clone(), start.clone(), 5).unwrap_err();
+    assert!(matches!(error, SolveError::TooDense { limit: FACTOR_BYTES_MAX, .. }), "{error}");
+    assert_eq!(minimum(&graph, start, 5).unwrap_err(), error);
+    assert!(error.to_string().contains("4096 are allowed"), "{error}");
 }

@@ -21,6 +21,14 @@ pub(in crate::estimate) struct Workspace {
     scratch: Scratch,
 }
 
+#[cfg(test)]
+impl Workspace {
+    /// Numbers that updates have had room for.
+    pub(super) fn capacity(&self) -> usize {
+        self.updates.capacity()
+    }
+}
+
 impl Factor {
     /// Gives the memory back, for the next `H`.
     pub(in crate::estimate) fn into_values(self) -> Vec<f64> {
@@ -32,11 +40,13 @@ impl BlockPattern {
     /// Factorises `H = L Lᵀ`.
     ///
     /// # Errors
-    /// [`SolveError::Underconstrained`] with the variable at which a pivot is not positive.
+    /// [`SolveError::Underconstrained`] with the variable at which a pivot is not positive; [`SolveError::OutOfMemory`].
     pub(in crate::estimate) fn factorise(&self, h: Vec<f64>, space: &mut Workspace) -> Result<Factor, SolveError> {
         let mut values = h;
         let Workspace { updates, scratch } = space;
         let mut top = 0;
+        let needed = self.update_count.saturating_sub(updates.len());
+        updates.try_reserve_exact(needed).map_err(|_| SolveError::OutOfMemory)?;
         for front in &self.fronts {
             // In postorder the children's updates lie on top, one after the other.
             let depth = front.depth();

@@ -10,6 +10,7 @@ mod clique;
 mod dense;
 mod front;
 mod inverse;
+mod memory;
 mod order;
 mod revise;
 #[cfg(test)]
@@ -22,6 +23,9 @@ use super::solve::SolveError;
 pub(super) use clique::Sum;
 pub(super) use front::{Factor, Workspace};
 pub(super) use inverse::SelectedInverse;
+pub use memory::FACTOR_BYTES_MAX;
+use memory::Needs;
+pub(super) use memory::zeroed;
 use order::Elimination;
 use std::ops::Range;
 pub(super) use tree::{Before, CliqueTree, Terms};
@@ -41,6 +45,8 @@ pub(super) struct BlockPattern {
     fronts: Vec<Front>,
     scalars: usize,
     value_count: usize,
+    /// Numbers of updates that wait for their parents, at most at a time.
+    update_count: usize,
 }
 
 /// Scalars that are eliminated together, and the later ones they are coupled with.
@@ -80,15 +86,30 @@ pub(super) struct Slot {
 
 impl BlockPattern {
     /// Analyses the pattern of `sizes.len()` variables of which those in each pair are coupled.
+    ///
+    /// # Errors
+    /// [`SolveError::TooDense`] where solving would take more than [`FACTOR_BYTES_MAX`].
     pub(super) fn new(sizes: &[usize], pairs: impl IntoIterator<Item = (usize, usize)>) -> Result<Self, SolveError> {
         Self::of_sizes([sizes], pairs).map(|[only]| only)
     }
 
     /// The patterns of equally many variables of several sizes, coupled alike. They are analysed once, for the first
     /// sizes: the fill, by variable, is the same for all.
+    ///
+    /// # Errors
+    /// See [`BlockPattern::new`].
     pub(super) fn of_sizes<const N: usize>(
         sizes: [&[usize]; N],
         pairs: impl IntoIterator<Item = (usize, usize)>,
+    ) -> Result<[Self; N], SolveError> {
+        Self::within(sizes, pairs, FACTOR_BYTES_MAX)
+    }
+
+    /// The same, with a limit of one's own.
+    pub(super) fn within<const N: usize>(
+        sizes: [&[usize]; N],
+        pairs: impl IntoIterator<Item = (usize, usize)>,
+        bytes_max: u64,
     ) -> Result<[Self; N], SolveError> {
         let first = sizes.first().copied().unwrap_or_default();
         let mut below: Vec<Vec<usize>> = vec![Vec::new(); first.len()];
@@ -101,11 +122,19 @@ impl BlockPattern {
             rows.sort_unstable();
             rows.dedup();
         }
-        let elimination = order::analyse(first, &below)?;
-        Ok(sizes.map(|sizes| Self::of(sizes, &elimination)))
+        let elimination = order::analyse(first, &below, bytes_max)?;
+        let mut counts = [0; N];
+        for (count, sizes) in counts.iter_mut().zip(sizes) {
+            let needs = Needs::of(&elimination, sizes);
+            memory::within(needs.bytes(), bytes_max)?;
+            // What is within the limit of bytes can be counted.
+            *count = usize::try_from(needs.updates).map_err(|_| SolveError::OutOfMemory)?;
+        }
+        let mut counts = counts.into_iter();
+        Ok(sizes.map(|sizes| Self::of(sizes, &elimination, counts.next().unwrap_or_default())))
     }
 
-    fn of(sizes: &[usize], Elimination { order, supernodes }: &Elimination) -> Self {
+    fn of(sizes: &[usize], Elimination { order, supernodes }: &Elimination, update_count: usize) -> Self {
         let mut scalar_of_place = Vec::with_capacity(order.len() + 1);
         scalar_of_place.push(0);
         let (mut starts, mut front_of, mut scalars) = (vec![0; order.len()], vec![0; order.len()], 0);
@@ -131,7 +160,7 @@ impl BlockPattern {
             fronts[k].into_parent = fronts[k].pieces_in(0, &fronts[parent]);
             fronts[parent].children.push(k);
         }
-        Self { starts, order: order.clone(), front_of, fronts, scalars, value_count }
+        Self { starts, order: order.clone(), front_of, fronts, scalars, value_count, update_count }
     }
 
     /// Scalars in all.

@@ -5,6 +5,7 @@
 //! parent where that stores few zeros, because one dense product is cheaper than two (Ashcraft and Grimes 1989).
 
 use super::super::solve::SolveError;
+use super::memory::Count;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::sparse::SymbolicSparseColMatRef;
 use faer::sparse::linalg::amd;
@@ -34,8 +35,11 @@ pub(super) struct Elimination {
 }
 
 /// Analyses the pattern of `sizes.len()` variables, given as each one's neighbours of smaller index (ascending, no
-/// repeats).
-pub(super) fn analyse(sizes: &[usize], below: &[Vec<usize>]) -> Result<Elimination, SolveError> {
+/// repeats), unless its factor takes more than `bytes_max`.
+///
+/// # Errors
+/// [`SolveError::TooDense`], [`SolveError::OutOfMemory`].
+pub(super) fn analyse(sizes: &[usize], below: &[Vec<usize>], bytes_max: u64) -> Result<Elimination, SolveError> {
     let order = minimum_degree(below)?;
     let later = later_neighbours(&order, below);
     let parents = elimination_tree(&later);
@@ -43,7 +47,8 @@ pub(super) fn analyse(sizes: &[usize], below: &[Vec<usize>]) -> Result<Eliminati
     let order: Vec<usize> = post.iter().map(|&place| order[place]).collect();
     let later = later_neighbours(&order, below);
     let parents = elimination_tree(&later);
-    let structures = structures(later, &parents);
+    let size_at: Vec<usize> = order.iter().map(|&variable| sizes[variable]).collect();
+    let structures = structures(later, &parents, &size_at, Count::new(bytes_max))?;
     let supernodes = supernodes(&order, sizes, structures, &parents);
     Ok(Elimination { order, supernodes })
 }
@@ -133,13 +138,19 @@ fn postorder(parents: &[Option<usize>]) -> Vec<usize> {
 }
 
 /// By place: all later places it is coupled with when it is eliminated, ascending.
-fn structures(mut later: Vec<Vec<usize>>, parents: &[Option<usize>]) -> Vec<Vec<usize>> {
+fn structures(
+    mut later: Vec<Vec<usize>>,
+    parents: &[Option<usize>],
+    size_at: &[usize],
+    mut count: Count,
+) -> Result<Vec<Vec<usize>>, SolveError> {
     for k in 0..later.len() {
+        count.add(size_at[k], later[k].iter().map(|&place| size_at[place]).sum())?;
         let Some(parent) = parents[k] else { continue };
         let inherited = merged(&later[parent], &later[k], parent);
         later[parent] = inherited;
     }
-    later
+    Ok(later)
 }
 
 /// The union of two ascending lists without `left_out`.
@@ -243,7 +254,7 @@ mod tests {
                 list.sort_unstable();
                 list.dedup();
             }
-            let out = analyse(&sizes, &below).unwrap();
+            let out = analyse(&sizes, &below, u64::MAX).unwrap();
             let mut sorted = out.order.clone();
             sorted.sort_unstable();
             prop_assert!(sorted.into_iter().eq(0..24));

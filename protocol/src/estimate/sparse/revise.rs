@@ -5,6 +5,7 @@
 //! forgetful children with it.
 
 use super::clique::{Clique, Sum};
+use super::memory::{self, FACTOR_BYTES_MAX};
 use super::order::{self, Elimination, Supernode};
 use super::tree::{CliqueTree, Memory, NONE, Terms};
 use crate::estimate::solve::SolveError;
@@ -95,7 +96,22 @@ impl CliqueTree {
             list.dedup();
         }
         let sizes: Vec<usize> = top.variables.iter().map(|&v| self.sizes[v]).collect();
-        Ok((order::analyse(&sizes, &coupled)?, local))
+        let elimination = order::analyse(&sizes, &coupled, FACTOR_BYTES_MAX)?;
+        memory::within(self.bytes_with(&elimination, &sizes), FACTOR_BYTES_MAX)?;
+        Ok((elimination, local))
+    }
+
+    /// Bytes that the tree takes while these cliques stand beside those they replace.
+    fn bytes_with(&self, Elimination { order, supernodes }: &Elimination, sizes: &[usize]) -> u64 {
+        let (mut numbers, mut square_max) = (self.kept_count() as u64, 0u64);
+        for node in supernodes {
+            let columns: u64 = node.pivots.clone().map(|place| sizes[order[place]] as u64).sum();
+            let depth: u64 = node.below.iter().map(|&place| sizes[order[place]] as u64).sum();
+            let (panel, square) = ((columns + depth).saturating_mul(columns), depth.saturating_mul(depth));
+            numbers = numbers.saturating_add(panel).saturating_add(square / 2 + 2 * depth + columns);
+            square_max = square_max.max(square);
+        }
+        memory::bytes(numbers.saturating_add(square_max))
     }
 
     /// The cliques of an elimination, children before parents; a parent is named by its place among them.

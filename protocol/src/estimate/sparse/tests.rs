@@ -125,3 +125,58 @@ fn a_pivot_that_is_not_positive_names_its_variable() {
     values[case.pattern.slot(5, 5).at] = f64::NAN;
     assert!(case.pattern.factorise(values.clone(), &mut Workspace::default()).is_err());
 }
+
+/// A random pattern, as [`order::analyse`] takes it and as [`BlockPattern`] does.
+fn pattern(seed: u64) -> (Vec<usize>, Vec<Vec<usize>>, Vec<(usize, usize)>) {
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    let sizes: Vec<usize> = (0..60).map(|_| rng.random_range(1..7)).collect();
+    let mut below = vec![Vec::new(); sizes.len()];
+    for _ in 0..90 {
+        let (a, b) = (rng.random_range(0..60usize), rng.random_range(0..60usize));
+        if a != b && !below[a.max(b)].contains(&a.min(b)) {
+            below[a.max(b)].push(a.min(b));
+        }
+    }
+    below.iter_mut().for_each(|list| list.sort_unstable());
+    let pairs = below.iter().enumerate().flat_map(|(a, list)| list.iter().map(move |&b| (a, b))).collect();
+    (sizes, below, pairs)
+}
+
+#[test]
+fn a_factorisation_is_refused_from_the_first_byte_above_its_limit() {
+    for seed in 0..50 {
+        let (sizes, below, pairs) = pattern(seed);
+        let needs = Needs::of(&order::analyse(&sizes, &below, u64::MAX).unwrap(), &sizes);
+        let bytes = needs.bytes();
+        let [at_limit] = BlockPattern::within([&sizes], pairs.iter().copied(), bytes).unwrap();
+        assert_eq!(at_limit.value_count() as u64, needs.values);
+        let error = BlockPattern::within([&sizes], pairs.iter().copied(), bytes - 1).unwrap_err();
+        assert_eq!(error, SolveError::TooDense { bytes, limit: bytes - 1 });
+        // Far above, the structure is not even found.
+        let SolveError::TooDense { bytes: so_far, .. } = BlockPattern::within([&sizes], pairs, 500).unwrap_err() else {
+            panic!("refused for another reason")
+        };
+        assert!(so_far > 500 && so_far < bytes);
+    }
+}
+
+#[test]
+fn updates_wait_in_just_the_memory_that_was_said() {
+    for seed in 0..50 {
+        let mut case = Case::new(seed, 40, 40);
+        for less in [0, 1] {
+            case.pattern.update_count = case.pattern.update_count.saturating_sub(less);
+            let mut space = Workspace::default();
+            case.pattern.factorise(case.values.clone(), &mut space).unwrap();
+            let grown = space.capacity() > case.pattern.update_count;
+            assert_eq!(grown, less == 1 && space.capacity() > 0, "seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn counting_saturates() {
+    let two = order::analyse(&[usize::MAX >> 1, usize::MAX >> 1], &[vec![], vec![0]], u64::MAX).unwrap();
+    assert_eq!(Needs::of(&two, &[usize::MAX >> 1; 2]).bytes(), u64::MAX);
+    assert!(memory::within(u64::MAX, u64::MAX).is_ok() && memory::within(u64::MAX, FACTOR_BYTES_MAX).is_err());
+}
