@@ -8,6 +8,7 @@
 //!    dropped, the largest first, and the graph solved again.
 //! 4. Sightings between merged frames, and alignments that no consensus weighed, join if they agree with that map.
 
+use super::among::{JointError, JointPoses};
 use super::distortion::{self, Charges};
 use super::graph::{Factor, Graph, Label};
 use super::intake::{Intake, Kind};
@@ -377,6 +378,32 @@ impl JointEstimate {
     /// within one frame (in its unit), a similarity otherwise.
     pub fn relative(&self, i: SubmapId, j: SubmapId) -> Option<Relative> {
         self.solution_of(i.frame, j.frame)?.relative(i, j, &self.unknown_scale)
+    }
+
+    /// [`JointEstimate::relative`] of many pairs that share few anchors, at one solve for each anchor; `None` for those
+    /// that are not connected.
+    pub fn relatives(&self, pairs: &[(SubmapId, SubmapId)]) -> Vec<Option<Relative>> {
+        let mut places: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for (place, (i, j)) in pairs.iter().enumerate() {
+            let component = self.component_of(i.frame).filter(|c| self.component_of(j.frame) == Some(*c));
+            component.into_iter().for_each(|c| places.entry(c).or_default().push(place));
+        }
+        let mut out = vec![None; pairs.len()];
+        for (component, places) in places {
+            let Some(solution) = &self.components[component].solution else { continue };
+            let relatives = solution.relatives(places.iter().map(|&place| pairs[place]), &self.unknown_scale);
+            places.iter().zip(relatives).for_each(|(&place, t)| out[place] = t);
+        }
+        out
+    }
+
+    /// `t_reference_anchor` of several anchors with their joint covariance ([`JointPoses`] says of what).
+    ///
+    /// # Errors
+    /// [`JointError`]; [`JointError::Apart`] too where the reference's component could not be solved.
+    pub fn joint(&self, reference: SubmapId, anchors: &[SubmapId]) -> Result<JointPoses, JointError> {
+        let solution = self.solution_of(reference.frame, reference.frame).ok_or(JointError::Apart(reference))?;
+        solution.joint(reference, anchors, &self.unknown_scale)
     }
 
     /// `t_reference_anchor`: the anchor in the reference frame's coordinates.

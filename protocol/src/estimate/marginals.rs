@@ -117,7 +117,7 @@ impl Solution {
     }
 
     /// `m` applied to the perturbation of one anchor, as (scalar, column).
-    fn row_block(&self, node: usize, m: &Matrix7) -> Vec<(usize, Vector7)> {
+    pub(super) fn row_block(&self, node: usize, m: &Matrix7) -> Vec<(usize, Vector7)> {
         let scalar = |(k, v): (usize, Option<(usize, usize)>)| {
             v.map(|(variable, offset)| (self.pattern.start(variable) + offset, m.column(k).into_owned()))
         };
@@ -159,7 +159,7 @@ impl Solution {
 }
 
 /// `Aᵀ` of `n` rows from its rows that are not zero, column by column.
-fn spread(rows: &[(usize, Vector7)], n: usize) -> Vec<f64> {
+pub(super) fn spread(rows: &[(usize, Vector7)], n: usize) -> Vec<f64> {
     let mut columns = vec![0.0; 7 * n];
     for (scalar, row) in rows {
         for c in 0..7 {

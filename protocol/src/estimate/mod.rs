@@ -1,5 +1,6 @@
 //! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
 
+pub mod among;
 pub mod certificate;
 pub mod chordal;
 pub mod distortion;
