@@ -144,10 +144,26 @@ pub struct PairView {
 }
 
 /// `view/poses`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PosesView {
     /// One per robot whose pose is known, this robot included.
     pub robots: Vec<RobotView>,
+    /// How robots lie by one another, where the joint estimate says so: every two of up to
+    /// [`ROBOTS_ALL_PAIRS_MAX`](crate::agent::ROBOTS_ALL_PAIRS_MAX), of more those with this robot.
+    #[serde(default)]
+    pub pairs: Vec<RobotPairView>,
+}
+
+/// Two live robots.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RobotPairView {
+    /// Name of the first.
+    pub a: String,
+    /// Name of the second.
+    pub b: String,
+    /// `t_a_b` of their bodies at their [`RobotView::stamp_secs`]. The covariance knows what the two have in common, so it
+    /// is smaller than that of two [`RobotView::t_own_body`] taken as independent.
+    pub t_a_b: RelationView,
 }
 
 /// A live robot.
@@ -190,7 +206,7 @@ pub struct SubmapView {
 }
 
 /// `view/graph`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct GraphView {
     /// Nodes of the joint estimate.
     pub nodes: u64,
@@ -200,8 +216,23 @@ pub struct GraphView {
     pub dof: u64,
     /// Whether the optimum is proved to be the global one; applies where every measurement's weight is isotropic.
     pub optimality: Optimality,
+    /// Whether every component was solved and converged; false before the first estimate.
+    #[serde(default)]
+    pub converged: bool,
+    /// The components that were not.
+    #[serde(default)]
+    pub failed: Vec<FailedView>,
     /// Alignments, sightings and positions, used or not (odometry edges are implied by the submaps).
     pub edges: Vec<EdgeView>,
+}
+
+/// A component of which there is no estimate, or none at its minimum.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FailedView {
+    /// Its frames, `name/epoch`.
+    pub frames: Vec<String>,
+    /// What is wrong, and what helps.
+    pub reason: String,
 }
 
 /// One alignment, sighting or position.

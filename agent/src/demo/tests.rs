@@ -124,7 +124,6 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
         },
         map: MapView { submaps: (0..3).flat_map(|r| (0..3).map(move |i| (r, i))).map(|(r, i)| submap(r, i)).collect() },
         graph: GraphView {
-            optimality: Default::default(),
             nodes: 9,
             chi2: 1.0,
             dof: 1,
@@ -137,6 +136,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
                 weight: 1.0,
                 reason: String::new(),
             }],
+            ..GraphView::default()
         },
         stats: StatsView { sent_bytes: BTreeMap::from([("facts".into(), 12_345)]), ..StatsView::default() },
     }

@@ -4,7 +4,7 @@
 use super::two_sided;
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
-use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, solve_map};
+use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, Shortfall, solve_map};
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
@@ -71,6 +71,8 @@ pub struct SolveJob {
     pub config: EstimateConfig,
     /// The frame that views are given in.
     pub own: FrameId,
+    /// Pairs of anchors whose relation is asked for.
+    pub live: Vec<(SubmapId, SubmapId)>,
 }
 
 /// What a [`Job`] gave.
@@ -89,6 +91,8 @@ pub enum JobResult {
 pub struct Solved {
     /// `t_own_anchor` of every submap connected to our frame.
     pub anchors: BTreeMap<SubmapId, Relative>,
+    /// `t_i_j` of the pairs that were asked for, cross-correlations included, where they are connected.
+    pub live: BTreeMap<(SubmapId, SubmapId), Relative>,
     /// Every frame of the problem.
     pub frames: BTreeMap<FrameId, Placed>,
     /// Every pair of frames with an agreed alignment, ascending.
@@ -103,6 +107,10 @@ pub struct Solved {
     pub nodes: usize,
     /// Whether it is proved to be the global optimum.
     pub optimality: Optimality,
+    /// Whether every component was solved and converged.
+    pub converged: bool,
+    /// The components that were not, and why.
+    pub failed: Vec<(Vec<FrameId>, Shortfall)>,
 }
 
 impl Solved {
@@ -114,6 +122,7 @@ impl Solved {
         };
         if !gaps.is_empty() {
             self.anchors = self.anchors.into_iter().map(|(id, t)| (index(id), t)).collect();
+            self.live = self.live.into_iter().map(|((i, j), t)| ((index(i), index(j)), t)).collect();
             for AgreedAlignment { i, j, .. } in self.edges.iter_mut().map(|edge| &mut edge.measurement) {
                 (*i, *j) = (index(*i), index(*j));
             }
@@ -184,8 +193,10 @@ impl SolveJob {
         let estimate = solve_map(&self.problem, &self.config);
         let components = estimate.components().filter_map(|frames| Some((*frames.iter().min()?, frames)));
         let placed = |frame| estimate.frame(self.own, frame);
+        let related = estimate.relatives(&self.live);
         Solved {
             anchors: estimate.anchors(self.own).into_iter().collect(),
+            live: self.live.iter().copied().zip(related).filter_map(|(pair, t)| Some((pair, t?))).collect(),
             frames: components
                 .flat_map(|(with, frames)| frames.iter().map(move |&f| (f, Placed { with, t_own_frame: placed(f) })))
                 .collect(),
@@ -195,6 +206,8 @@ impl SolveJob {
             dof: estimate.dof,
             nodes: estimate.nodes,
             optimality: estimate.optimality(),
+            converged: estimate.converged,
+            failed: estimate.shortfalls().map(|(frames, why)| (frames.to_vec(), why)).collect(),
         }
     }
 }

@@ -19,6 +19,7 @@ pub mod job;
 mod job_tests;
 mod knowledge;
 mod ledger;
+mod live;
 mod mapping;
 mod negotiation;
 mod promise;
@@ -60,6 +61,7 @@ use thiserror::Error;
 pub use condensing::GONE_IN_A_ROW_MAX;
 pub use gossip::BLOBS_MAX;
 pub use knowledge::Agreement;
+pub use live::ROBOTS_ALL_PAIRS_MAX;
 pub use mapping::CLOCK_BACK_KEYFRAMES;
 pub use negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP,

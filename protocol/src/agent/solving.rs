@@ -55,7 +55,8 @@ impl Agent {
             let odometry = |known: &Known| steps.of(known, || self.submap_fact(known).map(|fact| fact.odometry));
             let Question { problem, alone, gaps } = self.knowledge.question(own, odometry);
             self.map.steps = steps;
-            let job = SolveJob { problem, config, own };
+            let live = self.live_pairs(&problem, &gaps);
+            let job = SolveJob { problem, config, own, live };
             (self.map.posed_from, self.map.posed_alone, self.map.posed_gaps) = (Some(own), alone, gaps);
             self.map.dirty = false;
             self.map.posed_at = self.now;

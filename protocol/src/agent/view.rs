@@ -4,10 +4,11 @@
 use super::Agent;
 use super::knowledge::Agreement;
 use crate::estimate::EdgeKind;
-use crate::geometry::{PoseWithCovariance, Relative, Se3};
+use crate::estimate::joint::Shortfall;
+use crate::geometry::Se3;
 use crate::ids::{FrameId, RobotId, SubmapId};
 use crate::snapshot::{
-    EdgeView, FrameView, FramesView, GraphView, MapView, PairView, PoseView, PosesView, RelationView, RobotView,
+    EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, PairView, PoseView, PosesView, RelationView,
     Snapshot, StatsView, StatusView, SubmapView,
 };
 use crate::time::Instant;
@@ -123,36 +124,8 @@ impl Agent {
     }
 
     fn poses_view(&self, now: Instant) -> PosesView {
-        let own = self.mapper.body().map(|(index, t_anchor_body, stamp)| {
-            let anchor = SubmapId { frame: self.me.frame, index };
-            self.robot_view(self.me.robot, anchor, &t_anchor_body, 0.0, stamp.as_secs_f64())
-        });
-        let others = self.gossip.beacons().map(|(robot, seen)| {
-            let age = now.since(seen.at).as_secs_f64();
-            let seen = &seen.content;
-            self.robot_view(robot, seen.anchor, &seen.t_anchor_body, age, seen.stamp.as_secs_f64())
-        });
-        PosesView { robots: own.into_iter().chain(others).collect() }
-    }
-
-    /// Live pose = estimate ∘ beacon.
-    fn robot_view(
-        &self,
-        robot: RobotId,
-        anchor: SubmapId,
-        t_anchor_body: &PoseWithCovariance,
-        age_secs: f64,
-        stamp_secs: f64,
-    ) -> RobotView {
-        let t_own_anchor = self.t_own_anchor(anchor);
-        let t_own_body = t_own_anchor.map(|t| t.compose(&Relative::Metric(*t_anchor_body)));
-        RobotView {
-            robot: self.robot_name(robot),
-            age_secs,
-            stamp_secs,
-            anchor: self.submap_name(anchor),
-            t_own_body: t_own_body.as_ref().map(RelationView::from),
-        }
+        let live = self.live(now);
+        PosesView { robots: live.iter().map(|one| self.robot_view(one)).collect(), pairs: self.pairs_of(&live) }
     }
 
     fn map_view(&self) -> MapView {
@@ -199,12 +172,18 @@ impl Agent {
             });
         }
         edges.extend(self.unused_edges(&listed));
+        let failed = |(frames, why): &(Vec<FrameId>, Shortfall)| FailedView {
+            frames: frames.iter().map(|frame| self.frame_name(*frame)).collect(),
+            reason: why.to_string(),
+        };
         let nodes = solved.nodes + self.map.alone.values().sum::<usize>();
         GraphView {
             nodes: nodes as u64,
             chi2: solved.chi2,
             dof: solved.dof as u64,
             optimality: solved.optimality,
+            converged: solved.converged,
+            failed: solved.failed.iter().map(failed).collect(),
             edges,
         }
     }
@@ -266,7 +245,7 @@ impl Agent {
         format!("{}/{}", self.robot_name(frame.robot), frame.epoch)
     }
 
-    fn submap_name(&self, id: SubmapId) -> String {
+    pub(super) fn submap_name(&self, id: SubmapId) -> String {
         format!("{}#{}", self.frame_name(id.frame), id.index)
     }
 }

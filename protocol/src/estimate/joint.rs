@@ -176,7 +176,24 @@ pub struct PairEstimate {
 #[derive(Clone, Debug)]
 struct Component {
     frames: Vec<FrameId>,
-    solution: Option<Solution>,
+    solution: Result<Solution, SolveError>,
+}
+
+/// What a component's estimate falls short of.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+pub enum Shortfall {
+    /// It has none.
+    #[error("could not be solved, so that nothing is known but each frame's own odometry: {0}")]
+    Unsolved(SolveError),
+    /// It is not at the minimum.
+    #[error(
+        "no minimum after {iterations} iterations, so that poses and covariances are provisional; raise \
+             estimate.iterations_max"
+    )]
+    NotConverged {
+        /// Taken.
+        iterations: usize,
+    },
 }
 
 /// The map.
@@ -219,7 +236,7 @@ pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate
 
 /// Solved components while measurements are still being dropped.
 struct Map {
-    solutions: Vec<(BTreeSet<FrameId>, Option<Solution>)>,
+    solutions: Vec<Solved>,
     /// Latest `t_world_anchor`, the start of the next solve.
     start: BTreeMap<SubmapId, Sim3>,
 }
@@ -244,11 +261,11 @@ impl Map {
                         for Drop { label, chi2 } in reweight::contradictions(&solution, round) {
                             changed |= intake.drop_edge(label, Unused::Contradicts(chi2));
                         }
-                        solutions.push((frames, Some(solution)));
+                        solutions.push((frames, Ok(solution)));
                     }
                     Err(error) => {
                         changed |= intake.isolate_worst(&frames, error);
-                        solutions.push((frames, None));
+                        solutions.push((frames, Err(error)));
                     }
                 }
             }
@@ -262,8 +279,8 @@ impl Map {
     }
 
     fn relative(&self, unknown_scale: &BTreeSet<FrameId>, i: SubmapId, j: SubmapId) -> Option<Relative> {
-        let holds = |s: &&(BTreeSet<FrameId>, Option<Solution>)| s.0.contains(&i.frame) && s.0.contains(&j.frame);
-        self.solutions.iter().find(holds)?.1.as_ref()?.relative(i, j, unknown_scale)
+        let holds = |s: &&Solved| s.0.contains(&i.frame) && s.0.contains(&j.frame);
+        self.solutions.iter().find(holds)?.1.as_ref().ok()?.relative(i, j, unknown_scale)
     }
 }
 
@@ -333,12 +350,12 @@ impl JointEstimate {
             component_of.extend(frames.iter().map(|&f| (f, components.len())));
             components.push(Component { frames: frames.into_iter().collect(), solution });
         }
-        let solutions = || components.iter().filter_map(|c| c.solution.as_ref());
+        let solutions = || components.iter().filter_map(|c| c.solution.as_ref().ok());
         let mut out = Self {
             chi2: solutions().map(|s| s.chi2).sum(),
             dof: solutions().map(|s| s.dof).sum(),
             nodes: intake.chains.values().map(|c| c.len()).sum(),
-            converged: components.iter().all(|c| c.solution.as_ref().is_some_and(|s| s.converged)),
+            converged: components.iter().all(|c| c.solution.as_ref().is_ok_and(|s| s.converged)),
             components,
             component_of,
             origins,
@@ -357,6 +374,15 @@ impl JointEstimate {
         of_all.into_iter().next_back().unwrap_or_default()
     }
 
+    /// The components that could not be solved or did not converge, and what is wrong with them.
+    pub fn shortfalls(&self) -> impl Iterator<Item = (&[FrameId], Shortfall)> {
+        let why = |c: &Component| match &c.solution {
+            Err(error) => Some(Shortfall::Unsolved(*error)),
+            Ok(s) => (!s.converged).then_some(Shortfall::NotConverged { iterations: s.iterations }),
+        };
+        self.components.iter().filter_map(move |c| Some((c.frames.as_slice(), why(c)?)))
+    }
+
     /// The component of a frame; frames with the same number are connected. `None` for a frame without anchors.
     pub fn component_of(&self, frame: FrameId) -> Option<usize> {
         self.component_of.get(&frame).copied()
@@ -369,7 +395,7 @@ impl JointEstimate {
 
     /// `t_world_anchor` of a component's anchors, in the component's own arbitrary frame; empty if it was not solved.
     pub fn values(&self, component: usize) -> BTreeMap<SubmapId, Se3> {
-        let solution = self.components.get(component).and_then(|c| c.solution.as_ref());
+        let solution = self.components.get(component).and_then(|c| c.solution.as_ref().ok());
         let places = solution.into_iter().flat_map(|s| s.graph().nodes().iter().copied().zip(s.values()));
         places.filter(|(id, _)| !distortion::is_cloud(*id)).map(|(id, value)| (id, value.to_se3())).collect()
     }
@@ -390,7 +416,7 @@ impl JointEstimate {
         }
         let mut out = vec![None; pairs.len()];
         for (component, places) in places {
-            let Some(solution) = &self.components[component].solution else { continue };
+            let Ok(solution) = &self.components[component].solution else { continue };
             let relatives = solution.relatives(places.iter().map(|&place| pairs[place]), &self.unknown_scale);
             places.iter().zip(relatives).for_each(|(&place, t)| out[place] = t);
         }
@@ -451,6 +477,6 @@ impl JointEstimate {
 
     fn solution_of(&self, a: FrameId, b: FrameId) -> Option<&Solution> {
         let component = self.component_of(a).filter(|c| self.component_of(b) == Some(*c))?;
-        self.components[component].solution.as_ref()
+        self.components[component].solution.as_ref().ok()
     }
 }

@@ -218,9 +218,9 @@ pub(crate) mod tests {
         let snapshot = Snapshot {
             status,
             frames,
-            poses: PosesView { robots: Vec::new() },
+            poses: PosesView::default(),
             map: MapView { submaps: Vec::new() },
-            graph: GraphView { nodes: 0, chi2: 0.0, dof: 0, optimality: Default::default(), edges: Vec::new() },
+            graph: GraphView::default(),
             stats: StatsView::default(),
         };
         RobotSample {
