@@ -251,7 +251,7 @@ pub struct EdgeView {
     pub agreed: bool,
     /// Weight in the joint estimate, 0 if unused.
     pub weight: f64,
-    /// Why it is not used, or empty.
+    /// Why it is not used, or counts less than it claims; empty where it counts in full.
     pub reason: String,
 }
 
@@ -276,6 +276,18 @@ pub struct StatsView {
     /// or ask that waited.
     #[serde(default)]
     pub held_back: BTreeMap<String, u64>,
+    /// Bytes of this robot's logs that were condensed, before and after, summed over every time.
+    #[serde(default)]
+    pub condensed_bytes: CondensedView,
+}
+
+/// Bytes of entries, headers and signatures included.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CondensedView {
+    /// Of those that were replaced.
+    pub before: u64,
+    /// Of those in their place.
+    pub after: u64,
 }
 
 impl From<&Sim3> for PoseView {

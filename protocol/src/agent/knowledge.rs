@@ -276,8 +276,8 @@ impl Knowledge {
             .by_pair
             .iter()
             .filter(|((i, j), _)| place(*i).is_some() && place(*j).is_some())
-            .filter_map(|(_, ids)| ids.iter().find(|id| self.agreement(**id) == Agreement::Agreed))
-            .filter_map(|id| self.alignments.get(id).map(|fact| (*id, fact)))
+            .filter_map(|(pair, _)| self.counted(*pair))
+            .filter_map(|id| self.alignments.get(&id).map(|fact| (id, fact)))
             .filter_map(|(entry, fact)| {
                 let tie = tie(entry, fact.i, fact.j, self.measurement(entry, fact))?;
                 Some((tie, if bends(fact) { COMMON_BENT } else { COMMON_LIDAR }))
@@ -326,6 +326,11 @@ impl Knowledge {
             }
         }
         counts
+    }
+
+    /// Of all alignments of two submaps the one that counts: the first that both endpoints agree on.
+    pub fn counted(&self, pair: Pair) -> Option<EntryId> {
+        self.by_pair.get(&pair)?.iter().find(|id| self.agreement(**id) == Agreement::Agreed).copied()
     }
 
     /// Whether a LiDAR saw the submap, by its owner's word.

@@ -27,6 +27,8 @@ pub struct Stats {
     pub work: BTreeMap<&'static str, u64>,
     /// What the link's budget held back, by class.
     pub held_back: BTreeMap<&'static str, u64>,
+    /// Bytes of logs of our own that were condensed, before and after.
+    pub condensed_bytes: [u64; 2],
 }
 
 /// Refusals of one peer's input.
@@ -57,6 +59,13 @@ impl Stats {
     /// Counts what the link's budget held back.
     pub fn held_back(&mut self, class: Class, count: usize) {
         *self.held_back.entry(class.name()).or_default() += count as u64;
+    }
+
+    /// Counts what a log was, and is now that it is condensed.
+    pub fn condensed(&mut self, bytes: [usize; 2]) {
+        for (total, bytes) in self.condensed_bytes.iter_mut().zip(bytes) {
+            *total = total.saturating_add(bytes as u64);
+        }
     }
 
     /// Counts a refusal. `Some(suppressed)` if it should be reported now, with the number of refusals of this peer

@@ -6,12 +6,13 @@ use super::knowledge::Agreement;
 use crate::estimate::EdgeKind;
 use crate::estimate::joint::Shortfall;
 use crate::geometry::Se3;
-use crate::ids::{FrameId, RobotId, SubmapId};
+use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
 use crate::snapshot::{
-    EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, PairView, PoseView, PosesView, RelationView,
-    Snapshot, StatsView, StatusView, SubmapView,
+    CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, PairView, PoseView, PosesView,
+    RelationView, Snapshot, StatsView, StatusView, SubmapView,
 };
 use crate::time::Instant;
+use crate::wire::fact::AlignmentFact;
 use std::collections::{BTreeMap, BTreeSet};
 
 impl Agent {
@@ -168,7 +169,7 @@ impl Agent {
                 t_i_j: RelationView::from(&measurement.t_i_j),
                 agreed: true,
                 weight: edge.weight,
-                reason: edge.unused.as_ref().map(ToString::to_string).unwrap_or_default(),
+                reason: edge.reason(),
             });
         }
         edges.extend(self.unused_edges(&listed));
@@ -189,7 +190,7 @@ impl Agent {
     }
 
     /// Alignments that did not enter the estimate, with the reason.
-    fn unused_edges(&self, listed: &BTreeSet<crate::ids::EntryId>) -> Vec<EdgeView> {
+    fn unused_edges(&self, listed: &BTreeSet<EntryId>) -> Vec<EdgeView> {
         let unused = self.knowledge.alignments().filter(|(id, _)| !listed.contains(id));
         unused
             .map(|(id, fact)| {
@@ -201,15 +202,26 @@ impl Agent {
                     t_i_j: RelationView::from(&fact.t_i_j),
                     agreed: agreement == Agreement::Agreed,
                     weight: 0.0,
-                    reason: match agreement {
-                        Agreement::Waiting => "the other endpoint has not answered",
-                        Agreement::Disputed => "the other endpoint does not agree",
-                        Agreement::Agreed => "new, or another alignment of the pair is used",
-                    }
-                    .to_string(),
+                    reason: self.reason_outside(id, fact, agreement),
                 }
             })
             .collect()
+    }
+
+    /// Why an alignment is not among those that the estimate was made of.
+    fn reason_outside(&self, id: EntryId, fact: &AlignmentFact, agreement: Agreement) -> String {
+        let is_of_present_facts = self.map.digest == self.replica.digest();
+        match (agreement, self.knowledge.counted((fact.i, fact.j))) {
+            (Agreement::Waiting, _) => "the other endpoint has not answered".to_string(),
+            (Agreement::Disputed, _) => "the other endpoint does not agree".to_string(),
+            (Agreement::Agreed, Some(first)) if first != id => {
+                format!("another alignment of the same two submaps counts: {first}")
+            }
+            (Agreement::Agreed, _) if is_of_present_facts => {
+                "the odometry to one of its submaps is not known without a gap".to_string()
+            }
+            (Agreement::Agreed, _) => "newer than the estimate".to_string(),
+        }
     }
 
     fn stats_view(&self) -> StatsView {
@@ -233,6 +245,7 @@ impl Agent {
             rejected_by_peer: stats.rejected_by_peer.iter().map(|(peer, row)| (peer_name(peer), row.total)).collect(),
             work: counts(&stats.work),
             held_back: counts(&stats.held_back),
+            condensed_bytes: CondensedView { before: stats.condensed_bytes[0], after: stats.condensed_bytes[1] },
         }
     }
 

@@ -258,8 +258,34 @@ impl EdgeEstimate {
     /// Its weight where its pair found its standard deviations to need the factor `sigma_scale`. What it has in common
     /// with others counts against a similarity here; else the graph knows of it ([`distortion::factors`]).
     pub(super) fn weight_at(&self, sigma_scale: f64) -> f64 {
-        let charge = if self.measurement.t_i_j.metric().is_some() { 1.0 } else { self.charges.in_all };
-        1.0 / (charge * sigma_scale * sigma_scale)
+        1.0 / (self.charge() * sigma_scale * sigma_scale)
+    }
+
+    /// What its variance is multiplied by for what it has in common with others.
+    fn charge(&self) -> f64 {
+        if self.measurement.t_i_j.metric().is_some() { 1.0 } else { self.charges.in_all }
+    }
+
+    /// Why it counts less than it claims, or not at all; empty where it counts in full.
+    pub fn reason(&self) -> String {
+        if let Some(unused) = &self.unused {
+            return unused.to_string();
+        }
+        let charge = self.charge();
+        // What is left when the charge is taken away; a hair of rounding is no reason.
+        let sigma_scale = (1.0 / (self.weight * charge)).sqrt();
+        let mut reasons = Vec::new();
+        if charge > 1.0 {
+            reasons.push(format!(
+                "shares errors with other alignments of its submaps, which costs {charge:.2} times the variance"
+            ));
+        }
+        if sigma_scale > 1.0 + 1e-9 {
+            reasons.push(format!(
+                "the alignments of its pair of frames scatter more than they claim: standard deviations times {sigma_scale:.2}"
+            ));
+        }
+        reasons.join("; ")
     }
 
     /// Takes the edge out of the estimate.
