@@ -67,6 +67,24 @@ fn the_map_stays_and_the_bytes_go() {
             assert!(apart(k) <= 4.0 * (x.sigmas[k] + y.sigmas[k]), "{}#{}: {}", submap.frame, submap.index, apart(k));
         }
     }
+    for (k, agent) in short.agents.iter().enumerate() {
+        let snapshot = agent.snapshot(short.now);
+        let own = short.events.iter().filter(|(of, _)| *of == k);
+        let bytes =
+            own.filter_map(|(_, event)| if let Event::Condensed { bytes, .. } = event { Some(*bytes) } else { None });
+        let sums = bytes.fold([0, 0], |sum, [before, after]| [sum[0] + before as u64, sum[1] + after as u64]);
+        let told = snapshot.stats.condensed_bytes;
+        assert_eq!([told.before, told.after], sums);
+        // The other robot by this one, as each sees it.
+        let [own, other] = &snapshot.poses.robots[..] else { panic!("{:?}", snapshot.poses.robots) };
+        let [pair] = &snapshot.poses.pairs[..] else { panic!("{:?}", snapshot.poses) };
+        assert_eq!((&pair.a, &pair.b), (&own.robot, &other.robot));
+        assert!(pair.t_a_b.sigmas.iter().all(|sigma| (1e-4..1.0).contains(sigma)), "{:?}", pair.t_a_b);
+        assert!(snapshot.graph.converged && snapshot.graph.failed.is_empty());
+        let silent =
+            |edge: &&merganser_protocol::snapshot::EdgeView| edge.weight < 1.0 - 1e-9 && edge.reason.is_empty();
+        assert_eq!(snapshot.graph.edges.iter().find(silent), None);
+    }
     // What a late joiner fetches, what a restart reads.
     let entries = |wires: &Wires| {
         let len = |record: &Record| if let Record::Entry { bytes, .. } = record { bytes.len() } else { 0 };

@@ -5,7 +5,7 @@ use super::knowledge::{Knowledge, Known};
 use crate::config::EstimateConfig;
 use crate::estimate::test_graphs::rng;
 use crate::estimate::test_world::World;
-use crate::estimate::{JointEstimate, solve_map};
+use crate::estimate::{JointEstimate, MapProblem, solve_map};
 use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::{EntryId, FrameId, Hash, SubmapId};
 use crate::replica::testing::signed;
@@ -44,6 +44,8 @@ impl Logs {
             verdicts.push((j.frame, Fact::Verdict(VerdictFact { alignment, outcome })));
         }
         verdicts.into_iter().for_each(|(frame, verdict)| logs.get_mut(&frame).unwrap().push(verdict));
+        // As everybody reads them, so that what condensing changes is told from what the wire does.
+        logs.values_mut().flatten().for_each(|fact| *fact = as_read(fact));
         Self(logs)
     }
 
@@ -56,12 +58,16 @@ impl Logs {
         let mut knowledge = Knowledge::default();
         for (frame, facts) in &self.0 {
             for (seq, fact) in (0..).zip(facts) {
-                // As peers read it.
-                let fact = Fact::from_payload(fact.kind(), &fact.to_payload().unwrap()).unwrap();
-                knowledge.absorb(EntryId { frame: *frame, seq }, fact);
+                knowledge.absorb(EntryId { frame: *frame, seq }, fact.clone());
             }
         }
         knowledge
+    }
+
+    /// The submaps that stay.
+    fn kept(&self, frame: FrameId, knowledge: &Knowledge) -> Vec<u32> {
+        let gone = self.shorter(frame, knowledge).gone;
+        (0..ANCHORS as u32).filter(|&index| gone.iter().all(|(id, _)| id.index != index)).collect()
     }
 
     fn shorter(&self, frame: FrameId, knowledge: &Knowledge) -> Shorter {
@@ -72,8 +78,7 @@ impl Logs {
         let (mut condensed, mut held) = (Knowledge::default(), BTreeMap::new());
         for (frame, facts) in &self.0 {
             for (seq, part) in (facts.len() as u32..).zip(self.shorter(*frame, knowledge).parts) {
-                let fact = Fact::Condensed(part);
-                let fact = Fact::from_payload(fact.kind(), &fact.to_payload().unwrap()).unwrap();
+                let fact = as_read(&Fact::Condensed(part));
                 condensed.absorb(EntryId { frame: *frame, seq }, fact.clone());
                 held.insert(EntryId { frame: *frame, seq }, fact);
             }
@@ -99,6 +104,22 @@ impl Logs {
 
 type Gaps = BTreeMap<FrameId, Vec<u32>>;
 
+/// A fact after a journey.
+fn as_read(fact: &Fact) -> Fact {
+    Fact::from_payload(fact.kind(), &fact.to_payload().unwrap()).unwrap()
+}
+
+/// The least and the largest variance of a second estimate by that of the first, over all directions.
+fn variances(first: &Relative, second: &Relative) -> [f64; 2] {
+    let [first, second] = [first, second].map(|t| *t.metric().unwrap().covariance.matrix());
+    let l = first.cholesky().unwrap().l();
+    let half = l.solve_lower_triangular(&second).unwrap();
+    let whitened = l.solve_lower_triangular(&half.transpose()).unwrap();
+    let dense = nalgebra::DMatrix::from_iterator(6, 6, whitened.iter().copied());
+    let eigenvalues = ((&dense + dense.transpose()) * 0.5).symmetric_eigenvalues();
+    [eigenvalues.min(), eigenvalues.max()]
+}
+
 fn entry(seq: u32, floor: u32, fact: &Fact) -> Entry {
     signed(1, 4, seq, floor, if seq == 0 { Hash::default() } else { Hash::of(b"before") }, fact)
 }
@@ -117,9 +138,13 @@ fn submap(index: u32, odometry: PoseWithCovariance) -> Fact {
 }
 
 fn world(seed: u64) -> (World, [FrameId; 2]) {
+    world_with_noise(seed, true)
+}
+
+fn world_with_noise(seed: u64, noise: bool) -> (World, [FrameId; 2]) {
     let mut rng = rng(seed);
-    let mut world = World::new(&mut rng, 2, ANCHORS, false);
-    world.align_all(&mut rng, ALIGNMENTS, false);
+    let mut world = World::new(&mut rng, 2, ANCHORS, !noise);
+    world.align_all(&mut rng, ALIGNMENTS, !noise);
     let frames: Vec<FrameId> = world.frames.keys().copied().collect();
     (world, [frames[0], frames[1]])
 }
@@ -132,7 +157,7 @@ fn nees(estimate: &Relative, truth: &Se3) -> f64 {
 #[test]
 fn the_estimate_of_a_condensed_log_is_honest() {
     let (mut sums, mut count, mut anchors, mut anchor_count) = ([0.0; 2], 0, [0.0; 2], 0);
-    let (mut ratios, mut shifts) = (Vec::new(), Vec::new());
+    let (mut ratios, mut shifts, mut least) = (Vec::new(), Vec::new(), f64::INFINITY);
     for seed in 0..RUNS {
         let (world, [a, b]) = world(seed);
         let logs = Logs::of(&world);
@@ -150,6 +175,7 @@ fn the_estimate_of_a_condensed_log_is_honest() {
         let (x, y) = (full.anchor(a, last).unwrap(), short.anchor(a, SubmapId { index: place, ..last }).unwrap());
         (anchors[0], anchors[1]) = (anchors[0] + nees(&x, &truth), anchors[1] + nees(&y, &truth));
         anchor_count += 1;
+        least = least.min(variances(&x, &y)[0]);
         let (x, y) = (*x.metric().unwrap(), *y.metric().unwrap());
         ratios.push(y.covariance.matrix().trace() / x.covariance.matrix().trace());
         shifts.push(x.covariance.mahalanobis_squared(&x.pose.local(&y.pose)).sqrt());
@@ -159,7 +185,7 @@ fn the_estimate_of_a_condensed_log_is_honest() {
     let anees = [sums[0], sums[1], anchors[0], anchors[1]].map(|sum| sum / f64::from(count) / 6.0);
     println!(
         "{count} runs, ANEES/dof of frames {:.3} whole, {:.3} condensed; of anchors {:.3} whole, {:.3} condensed; \
-         covariance trace {:.4} to {:.4}, median {:.4}; shift median {:.3}, largest {:.3} sigma",
+         covariance trace {:.4} to {:.4}, median {:.4}, least of any direction {least:.4}; shift median {:.3}, largest {:.3} sigma",
         anees[0],
         anees[1],
         anees[2],
@@ -174,8 +200,60 @@ fn the_estimate_of_a_condensed_log_is_honest() {
     for anees in anees {
         assert!((0.93..=1.07).contains(&anees), "{anees}");
     }
-    assert!(ratios[0] > 0.99, "surer than before: {}", ratios[0]);
+    // Compounding itself is exact (the next test). Here the odometry is linearised where it was measured, and in the whole
+    // graph where the loops move it to: by so much the two differ, to either side.
+    assert!(ratios[0] > 0.995 && least > 0.98, "surer than before: {}, {least}", ratios[0]);
     assert!(shifts[shifts.len() - 1] < 0.3, "{}", shifts[shifts.len() - 1]);
+}
+
+/// Where the measurements agree, so that whole and condensed graph are linearised at one place, no direction of any
+/// relation is surer than before: to rounding if steps are compounded as they are, and as the wire has them.
+#[test]
+fn a_condensed_log_is_never_surer_than_what_it_replaces() {
+    let (mut compounded, mut written) = ([f64::INFINITY, 0.0], [f64::INFINITY, 0.0f64]);
+    let widen = |range: &mut [f64; 2], [least, most]: [f64; 2]| *range = [range[0].min(least), range[1].max(most)];
+    for seed in 0..20 {
+        let (world, [a, b]) = world_with_noise(seed, false);
+        let logs = Logs::of(&world);
+        let knowledge = logs.knowledge();
+        let kept: Gaps = [a, b].map(|frame| (frame, logs.kept(frame, &knowledge))).into();
+        assert!(kept.values().all(|kept| kept.len() < ANCHORS - 5));
+        let place = |id: SubmapId| SubmapId { index: kept[&id.frame].binary_search(&id.index).unwrap() as u32, ..id };
+        let whole = world.solve();
+        let exact = solve_map(&compound(&world.problem, &kept), &EstimateConfig::default());
+        let (read, _) = logs.solve(&knowledge, a, &BTreeMap::new());
+        let (condensed, held) = logs.condensed(&knowledge);
+        let (condensed, _) = logs.solve(&condensed, a, &held);
+        for (i, j) in [(0, ANCHORS - 1), (ANCHORS - 1, ANCHORS - 1), (ANCHORS - 1, 0)] {
+            let (i, j) = (SubmapId { frame: a, index: i as u32 }, SubmapId { frame: b, index: j as u32 });
+            let (Some(x), Some(y)) = (whole.relative(i, j), exact.relative(place(i), place(j))) else { continue };
+            widen(&mut compounded, variances(&x, &y));
+            let (x, y) = (read.relative(i, j).unwrap(), condensed.relative(place(i), place(j)).unwrap());
+            widen(&mut written, variances(&x, &y));
+        }
+    }
+    println!("variance of the condensed by that of the whole: compounded {compounded:?}, written and read {written:?}");
+    assert!(compounded[0] > 1.0 - 1e-9 && compounded[1] < 1.0 + 1e-9, "{compounded:?}");
+    // Means are rounded to 24 bits, by which the two are linearised at places that far apart.
+    assert!(written[0] > 1.0 - 1e-6 && written[1] < 1.02, "{written:?}");
+}
+
+/// The problem without the submaps that are not kept, their steps compounded, nothing rounded.
+fn compound(problem: &MapProblem, kept: &Gaps) -> MapProblem {
+    let mut out = problem.clone();
+    for (frame, chain) in &mut out.frames {
+        let mut way: Option<PoseWithCovariance> = None;
+        let mut odometry = Vec::new();
+        for (index, step) in (0..).zip(&chain.odometry) {
+            let step = way.take().map_or(*step, |way| way.compose(step));
+            if kept[frame].contains(&index) { odometry.push(step) } else { way = Some(step) }
+        }
+        chain.odometry = odometry;
+    }
+    for id in out.alignments.iter_mut().flat_map(|m| [&mut m.i, &mut m.j]) {
+        id.index = kept[&id.frame].binary_search(&id.index).unwrap() as u32;
+    }
+    out
 }
 
 #[test]

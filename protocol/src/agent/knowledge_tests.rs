@@ -150,3 +150,18 @@ fn the_order_of_facts_changes_nothing() {
     assert_eq!(forward.agreement(stated.0), backward.agreement(stated.0));
     assert_eq!(problem(&forward), problem(&backward));
 }
+
+#[test]
+fn of_two_agreed_alignments_of_a_pair_the_first_counts() {
+    let pair = (anchor(1), anchor(2));
+    let facts = [
+        (entry(1, 1), alignment(1, 2, 1.0, 0.1)),
+        (entry(1, 2), alignment(1, 2, 1.01, 0.1)),
+        (entry(2, 1), verdict(entry(1, 2), 1.0, 0.1)),
+    ];
+    assert_eq!(knowledge(&facts[..2]).counted(pair), None);
+    assert_eq!(knowledge(&facts).counted(pair), Some(entry(1, 2)));
+    let both: Vec<_> = facts.into_iter().chain([(entry(2, 2), verdict(entry(1, 1), 1.0, 0.1))]).collect();
+    assert_eq!(knowledge(&both).counted(pair), Some(entry(1, 1)));
+    assert_eq!(problem(&knowledge(&both)).alignments[0].entry, entry(1, 1));
+}

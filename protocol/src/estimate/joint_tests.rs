@@ -357,3 +357,51 @@ fn a_large_map_is_solved_and_read_out() {
     let anchors = map.anchors(frame(0)).len();
     assert_eq!((map.components().len(), anchors), (1, 300));
 }
+
+#[test]
+fn what_counts_less_than_it_claims_says_why() {
+    let (mut scattered, mut shared, mut full) = (0, 0, 0);
+    for seed in 0..10 {
+        let rng = &mut rng(4_400 + seed);
+        let mut world = World::scaled(rng, &[None, Some(0.5), None], 12, false);
+        world.align(rng, frame(0), frame(1), 5, true);
+        world.align(rng, frame(0), frame(2), 6, false);
+        // Two alignments of one submap, and a pair that claims to be five times as sure as it is.
+        let again = world.measure(None, submap(0, 3), submap(1, 4));
+        world.state(submap(0, 3), submap(1, 4), again);
+        let again = world.measure(None, submap(0, 3), submap(1, 8));
+        world.state(submap(0, 3), submap(1, 8), again);
+        for alignment in &mut world.problem.alignments {
+            if let Relative::Metric(t) = &mut alignment.t_i_j {
+                t.covariance = t.covariance.scaled(0.04);
+            }
+        }
+        world.problem.common = world.problem.alignments.iter().map(|a| (a.entry, 0.3)).collect();
+        for edge in world.solve().edges() {
+            let reason = edge.reason();
+            assert_eq!(reason.is_empty(), edge.is_used() && edge.weight > 1.0 - 1e-9, "{} {reason}", edge.weight);
+            scattered += usize::from(reason.contains("scatter more than they claim"));
+            shared += usize::from(reason.contains("shares errors"));
+            full += usize::from(reason.is_empty());
+            let refused = edge.unused.map(|why| why.to_string());
+            assert!(refused.is_none_or(|refused| refused == reason));
+        }
+    }
+    println!("{scattered} edges scatter, {shared} share errors, {full} count in full");
+    assert!(scattered > 10 && shared > 10 && full > 10);
+}
+
+#[test]
+fn what_did_not_converge_is_named() {
+    let rng = &mut rng(4_500);
+    let mut world = World::new(rng, 3, 10, false);
+    world.align(rng, frame(0), frame(1), 4, false);
+    let map = world.solve();
+    assert!(map.converged && map.shortfalls().next().is_none());
+    let config = EstimateConfig { iterations_max: 1, ..EstimateConfig::default() };
+    let map = solve_map(&world.problem, &config);
+    let short: Vec<_> = map.shortfalls().map(|(frames, why)| (frames.to_vec(), why)).collect();
+    assert!(!map.converged);
+    assert_eq!(short, [(vec![frame(0), frame(1)], Shortfall::NotConverged { iterations: 1 })]);
+    assert!(short[0].1.to_string().contains("estimate.iterations_max"));
+}
