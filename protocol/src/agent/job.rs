@@ -4,6 +4,7 @@
 use super::two_sided;
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
+use crate::estimate::ends::End;
 use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, Shortfall, solve_map};
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
@@ -93,6 +94,8 @@ pub struct Solved {
     pub anchors: BTreeMap<SubmapId, Relative>,
     /// `t_i_j` of the pairs that were asked for, cross-correlations included, where they are connected.
     pub live: BTreeMap<(SubmapId, SubmapId), Relative>,
+    /// How robots go on from the last of them.
+    pub ends: BTreeMap<SubmapId, End>,
     /// Every frame of the problem.
     pub frames: BTreeMap<FrameId, Placed>,
     /// Every pair of frames with an agreed alignment, ascending.
@@ -123,6 +126,7 @@ impl Solved {
         if !gaps.is_empty() {
             self.anchors = self.anchors.into_iter().map(|(id, t)| (index(id), t)).collect();
             self.live = self.live.into_iter().map(|((i, j), t)| ((index(i), index(j)), t)).collect();
+            self.ends = self.ends.into_iter().map(|(id, end)| (index(id), end)).collect();
             for AgreedAlignment { i, j, .. } in self.edges.iter_mut().map(|edge| &mut edge.measurement) {
                 (*i, *j) = (index(*i), index(*j));
             }
@@ -197,6 +201,7 @@ impl SolveJob {
         Solved {
             anchors: estimate.anchors(self.own).into_iter().collect(),
             live: self.live.iter().copied().zip(related).filter_map(|(pair, t)| Some((pair, t?))).collect(),
+            ends: estimate.ends(self.own),
             frames: components
                 .flat_map(|(with, frames)| frames.iter().map(move |&f| (f, Placed { with, t_own_frame: placed(f) })))
                 .collect(),

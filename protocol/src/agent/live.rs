@@ -3,7 +3,8 @@
 //!
 //! A robot is where its anchor is, by the estimate, and by that anchor where its beacon says. The anchors of two robots
 //! are correlated, as whatever ties both of them to a third moves both alike: so their relation is asked of the estimate
-//! itself, and never made of two poses in our frame (MATH §3). The beacons are independent of it and of one another.
+//! itself, and never made of two poses in our frame (MATH §3). The beacons are independent of one another; in relations of
+//! two robots they are taken to be so of the estimate too, which is cautious ([`ends`](crate::estimate::ends)).
 
 use super::Agent;
 use super::knowledge::Gaps;
@@ -63,8 +64,7 @@ impl Agent {
 
     /// Live pose = estimate ∘ beacon.
     pub(super) fn robot_view(&self, live: &Live) -> RobotView {
-        let t_own_anchor = self.t_own_anchor(live.anchor);
-        let t_own_body = t_own_anchor.map(|t| t.compose(&Relative::Metric(live.t_anchor_body)));
+        let t_own_body = self.t_own_body(live.anchor, &live.t_anchor_body);
         RobotView {
             robot: self.robot_name(live.robot),
             age_secs: live.age_secs,

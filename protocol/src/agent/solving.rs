@@ -5,7 +5,7 @@ use super::io::{Event, JobId};
 use super::job::{Job, SolveJob, Solved};
 use super::knowledge::{Gaps, Known, Question};
 use super::steps::Steps;
-use crate::geometry::Relative;
+use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{EntryId, FrameId, Hash, SubmapId};
 use crate::time::Instant;
 use crate::wire::fact::{Fact, SubmapFact};
@@ -103,6 +103,17 @@ impl Agent {
     /// `t_own_anchor`, likewise.
     pub(super) fn t_own_anchor(&self, submap: SubmapId) -> Option<&Relative> {
         self.solved_for_own()?.anchors.get(&submap)
+    }
+
+    /// `t_own_body` of a body that is known by the anchor of a submap: estimate ∘ beacon, and what their errors have to do
+    /// with one another.
+    pub(super) fn t_own_body(&self, anchor: SubmapId, t_anchor_body: &PoseWithCovariance) -> Option<Relative> {
+        let solved = self.solved_for_own()?;
+        let t_own_anchor = solved.anchors.get(&anchor)?;
+        Some(match (t_own_anchor, solved.ends.get(&anchor)) {
+            (Relative::Metric(t_own_anchor), Some(end)) => Relative::Metric(end.onward(t_own_anchor, t_anchor_body)),
+            _ => t_own_anchor.compose(&Relative::Metric(*t_anchor_body)),
+        })
     }
 
     fn solved_for_own(&self) -> Option<&Solved> {

@@ -319,6 +319,12 @@ impl Chain {
         [to, from].into_iter().flatten().min_by(|a, b| volume(a).total_cmp(&volume(b)))
     }
 
+    /// The last anchor and the odometry's walk while its submap was made.
+    pub(super) fn end(&self, frame: FrameId) -> Option<(SubmapId, Covariance<6>)> {
+        let last = self.len().checked_sub(1)?;
+        Some((SubmapId { frame, index: u32::try_from(last).ok()? }, *self.walk(last)?))
+    }
+
     /// Number of anchors.
     pub(super) fn len(&self) -> usize {
         self.trajectory.len()

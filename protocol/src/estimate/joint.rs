@@ -10,6 +10,7 @@
 
 use super::among::{JointError, JointPoses};
 use super::distortion::{self, Charges};
+use super::ends::{self, End};
 use super::graph::{Factor, Graph, Label};
 use super::intake::{Intake, Kind};
 use super::marginals::certain;
@@ -19,7 +20,7 @@ use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
 use super::solve::{Solution, SolveError, solve_within};
 use crate::config::EstimateConfig;
-use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
@@ -203,6 +204,8 @@ pub struct JointEstimate {
     component_of: BTreeMap<FrameId, usize>,
     /// `t_frame_anchor0`.
     origins: BTreeMap<FrameId, PoseWithCovariance>,
+    /// The last anchor of each metric frame and the walk while its submap was made.
+    lasts: BTreeMap<FrameId, (SubmapId, Covariance<6>)>,
     unknown_scale: BTreeSet<FrameId>,
     pairs: Vec<PairEstimate>,
     edges: Vec<EdgeEstimate>,
@@ -344,6 +347,8 @@ impl EdgeEstimate {
 impl JointEstimate {
     fn new(intake: Intake, pairs: Vec<Pair>, map: Map) -> Self {
         let origins = intake.chains.iter().map(|(&f, chain)| (f, chain.origin)).collect();
+        let metric = intake.chains.iter().filter(|(f, _)| !intake.unknown_scale.contains(f));
+        let lasts = metric.filter_map(|(&f, chain)| Some((f, chain.end(f)?))).collect();
         let mut components = Vec::new();
         let mut component_of = BTreeMap::new();
         for (frames, solution) in map.solutions {
@@ -359,6 +364,7 @@ impl JointEstimate {
             components,
             component_of,
             origins,
+            lasts,
             unknown_scale: intake.unknown_scale,
             pairs: Vec::new(),
             edges: intake.edges,
@@ -454,6 +460,17 @@ impl JointEstimate {
         let place = |(id, t): (SubmapId, Relative)| (id, if id == first { origin } else { origin.compose(&t) });
         let all = solution.relatives_to(first, &self.unknown_scale).into_iter();
         all.filter(|(id, _)| !distortion::is_cloud(*id)).map(place).collect()
+    }
+
+    /// How robots go on from the last submaps of the metric frames in the reference's component, those that alignments
+    /// tell of: with it [`JointEstimate::anchor`] becomes the pose of a body.
+    pub fn ends(&self, reference: FrameId) -> BTreeMap<SubmapId, End> {
+        let first = SubmapId { frame: reference, index: 0 };
+        let solution = self.solution_of(reference, reference).filter(|_| !self.unknown_scale.contains(&reference));
+        let Some(solution) = solution else { return BTreeMap::new() };
+        let together =
+            self.lasts.iter().filter(|(frame, _)| self.component_of(**frame) == self.component_of(reference));
+        ends::ends(solution, first, together.map(|(_, (last, walk))| (*last, walk)))
     }
 
     /// `t_a_b` between the frames' origins.

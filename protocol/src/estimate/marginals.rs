@@ -64,19 +64,26 @@ impl Solution {
 
     /// Covariance of δ in `X_a⁻¹ X_b ⊕ δ`; its scale row is zero where both ends share one scale.
     pub(super) fn covariance_between(&self, a: usize, b: usize) -> Option<Matrix7> {
+        let half = self.half_solved(a, b);
+        let lower = Matrix7::from_fn(|r, c| if r >= c { half.dot(r, &half, c) } else { 0.0 });
+        Some(Matrix7::from_fn(|r, c| lower[(r.max(c), r.min(c))]))
+    }
+
+    /// Covariance of δ in `X_reference⁻¹ X_a ⊕ δ` with the perturbation of `X_a⁻¹ X_b`, between anchors of one unit: how
+    /// what a step onward from a is off by goes with what a is.
+    pub(super) fn covariance_onward(&self, reference: SubmapId, a: SubmapId, b: SubmapId) -> Option<Matrix6<f64>> {
+        let [reference, a, b] = [reference, a, b].map(|id| self.graph.position(id));
+        let (to, onward) = (self.half_solved(reference?, a?), self.half_solved(a?, b?));
+        Some(Matrix6::from_fn(|r, c| to.dot(r, &onward, c)))
+    }
+
+    /// `L⁻¹ Aᵀ` for the row block A of `X_a⁻¹ X_b`.
+    fn half_solved(&self, a: usize, b: usize) -> HalfSolved {
         let t_b_a = self.values[b].inverse() * self.values[a];
         let rows = self.difference(a, b, &t_b_a.adjoint());
-        let n = self.pattern.scalars();
-        let mut half = spread(&rows, n);
-        let touched = self.pattern.solve_upwards(&self.factor, rows.iter().map(|(scalar, _)| *scalar), &mut half);
-        let dot = |r: usize, c: usize| {
-            let (x, y) = (&half[r * n..(r + 1) * n], &half[c * n..(c + 1) * n]);
-            let over =
-                |range: &Range<usize>| x[range.clone()].iter().zip(&y[range.clone()]).map(|(x, y)| x * y).sum::<f64>();
-            touched.iter().map(over).sum::<f64>()
-        };
-        let lower = Matrix7::from_fn(|r, c| if r >= c { dot(r, c) } else { 0.0 });
-        Some(Matrix7::from_fn(|r, c| lower[(r.max(c), r.min(c))]))
+        let mut columns = spread(&rows, self.pattern.scalars());
+        let touched = self.pattern.solve_upwards(&self.factor, rows.iter().map(|(scalar, _)| *scalar), &mut columns);
+        HalfSolved { columns, touched, n: self.pattern.scalars() }
     }
 
     /// [`Solution::covariance_between`] for two anchors that a factor ties, from the selected inverse instead of solves.
@@ -155,6 +162,24 @@ impl Solution {
         }
         out[6] = self.graph.scale_of(node).map(|s| (self.graph.nodes().len() - 1 + s, 0));
         out
+    }
+}
+
+/// `L⁻¹ Aᵀ`: seven columns of `n` scalars, of which all but some ranges are zero.
+struct HalfSolved {
+    columns: Vec<f64>,
+    touched: Vec<Range<usize>>,
+    n: usize,
+}
+
+impl HalfSolved {
+    /// The inner product of one column and another's.
+    fn dot(&self, column: usize, other: &Self, of_other: usize) -> f64 {
+        let of = |half: &'_ Self, k: usize| k * half.n..(k + 1) * half.n;
+        let (x, y) = (&self.columns[of(self, column)], &other.columns[of(other, of_other)]);
+        let over =
+            |range: &Range<usize>| x[range.clone()].iter().zip(&y[range.clone()]).map(|(x, y)| x * y).sum::<f64>();
+        self.touched.iter().map(over).sum::<f64>()
     }
 }
 

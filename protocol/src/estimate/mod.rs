@@ -4,6 +4,7 @@ pub mod among;
 pub mod certificate;
 pub mod chordal;
 pub mod distortion;
+pub mod ends;
 pub mod frames;
 pub mod graph;
 pub mod incremental;
