@@ -21,7 +21,7 @@ use std::path::Path;
 use thiserror::Error;
 
 /// Version of the format.
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 /// Largest frame read, in bytes: a keyframe of [`crate::observation::POINTS_MAX`] points is 4.8 MB, a restored store may be more.
 const FRAME_LEN_MAX: u32 = 1 << 30;
 

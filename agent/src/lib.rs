@@ -5,6 +5,7 @@ pub mod cli;
 pub mod commands;
 pub mod config;
 pub mod demo;
+pub mod depth;
 pub mod driver;
 pub mod host;
 pub mod journal;

@@ -25,6 +25,22 @@
 //! "place": {"model": "netvlad-pitts30k", "metric": "cosine", "vector": [0.017, -0.004, 0.021]}
 //! ```
 //!
+//! A depth camera may send its image as it is, as `depth` instead of `points`: 16 bits a pixel, rectified, with the
+//! intrinsics of this very image in pixels and what one count is. `data` is, in JSON, the base64 of two bytes a pixel, low
+//! byte first (ROS's `16UC1`), or of a PNG of 16-bit grey if `encoding` is `"png"`; in postcard those bytes themselves.
+//! `range_m` (what to trust) and `t_body_camera` (without it the body is the camera: x right, y down, z forward) may be
+//! left out. Large images are thinned to 10,000 pixels; who wants other points sends points.
+//!
+//! ```text
+//! "depth": {"width": 640, "height": 480, "fx": 585, "fy": 585, "cx": 320, "cy": 240, "unit_m": 0.001,
+//!           "range_m": [0.3, 4.0], "t_body_camera": {"translation": [0.1, 0, 0.3], "rotation": [-0.5, 0.5, -0.5, 0.5]},
+//!           "encoding": "raw", "data": "6AMAAOgD…"}
+//! ```
+//!
+//! An organised cloud, which keeps the camera's or the LiDAR's grid, has NaN or infinity where nothing was measured: say
+//! `"organised": true` and such points are left out. Of any other cloud they are a mistake and refuse it. JSON has no NaN;
+//! there, leave the points out yourself.
+//!
 //! A sighting of another robot states how it lies and is turned (`in/sighting`: `translation`, `rotation` and `covariance` of
 //! `t_body_other`, as in a keyframe); a range and a bearing, or a detection in an image of known depth, states where its
 //! body is alone (`in/position`), with the upper triangle of the 3×3 covariance, row by row:
@@ -34,6 +50,11 @@
 //!  "covariance": [1e-2, 0, 0, 4e-3, 0, 1.0]}
 //! ```
 
+mod depth;
+
+pub use depth::{CameraPose, Data, DepthEncoding, DepthMessage};
+
+use crate::depth::DepthError;
 use merganser_protocol::agent::io::{PositionSighting, Sighting};
 use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::Name;
@@ -42,8 +63,9 @@ use merganser_protocol::submap::place::Metric;
 use merganser_protocol::submap::{CovarianceOf, Keyframe, Mark, PlaceDescriptor, PlaceError};
 use merganser_protocol::time::Stamp;
 use nalgebra::{Matrix3, Matrix6, Vector3};
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, IgnoredAny};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use thiserror::Error;
 
 /// Points in one keyframe at most.
@@ -66,7 +88,8 @@ pub struct KeyframeMessage {
     /// What the covariance describes.
     #[serde(default)]
     pub covariance_of: CovarianceOf,
-    /// Points in the body frame.
+    /// Points in the body frame; none if the keyframe has a depth image.
+    #[serde(default)]
     pub points: Vec<[f32; 3]>,
     /// What else is known of each point, if these are landmarks; else none.
     #[serde(default)]
@@ -74,6 +97,12 @@ pub struct KeyframeMessage {
     /// What the user's own place recognition says, if there is one.
     #[serde(default)]
     pub place: Option<PlaceMessage>,
+    /// What a depth camera saw, instead of points.
+    #[serde(default)]
+    pub depth: Option<DepthMessage>,
+    /// Whether points that are not finite stand for nothing measured.
+    #[serde(default)]
+    pub organised: bool,
 }
 
 /// A place descriptor of the user's own.
@@ -182,8 +211,26 @@ pub enum ObservationError {
     /// The place descriptor is none.
     #[error("{0}")]
     Place(#[from] PlaceError),
+    /// Neither points nor a depth image.
+    #[error("neither points nor depth; send one of them, and \"points\": [] where nothing was seen")]
+    Neither,
+    /// Points and a depth image.
+    #[error("both points and depth; send one of them")]
+    Both,
+    /// The depth image is refused.
+    #[error("depth: {0}")]
+    Depth(#[from] DepthError),
+    /// The camera's rotation is no rotation.
+    #[error("depth.t_body_camera.rotation: a quaternion [x, y, z, w] cannot be zero")]
+    CameraRotation,
+    /// Organised landmarks.
+    #[error("organised clouds leave points out, so landmarks could not be told apart; send the landmarks there are")]
+    OrganisedLandmarks,
+    /// Nothing of an organised cloud was measured.
+    #[error("none of the {0} points of the organised cloud is finite; leave the keyframe out")]
+    Unmeasured(usize),
     /// Too many points.
-    #[error("{0} points; send at most {POINTS_MAX}, thinned if need be")]
+    #[error("too many points: {0}; send at most {POINTS_MAX}, thinned if need be")]
     Points(usize),
 }
 
@@ -195,20 +242,33 @@ pub fn keyframe(format: Format, bytes: &[u8]) -> Result<Keyframe, ObservationErr
     let message = decode::<KeyframeMessage>(format, bytes).or_else(|error| match error {
         ObservationError::Postcard(_) => of_earlier_days(bytes).ok_or(error),
         _ => Err(error),
-    });
-    Keyframe::try_from(message?)
+    })?;
+    let is_empty = message.points.is_empty() && message.depth.is_none();
+    if format == Format::Json && is_empty && !states_points(bytes) {
+        return Err(ObservationError::Neither);
+    }
+    Keyframe::try_from(message)
 }
 
-/// A postcard message that ends with its landmarks or with its points: what follows was not known yet.
+/// Whether a JSON message says that there are no points, and does not merely lack them.
+fn states_points(json: &[u8]) -> bool {
+    serde_json::from_slice::<BTreeMap<String, IgnoredAny>>(json).is_ok_and(|fields| fields.contains_key("points"))
+}
+
+/// A postcard message that ends with its points or with what was added after them until some day: the rest was not known
+/// yet. Each addition is a zero byte where there is nothing of it.
 fn of_earlier_days(bytes: &[u8]) -> Option<KeyframeMessage> {
+    const ADDED: usize = 4;
     let completed = |missing: usize| {
-        let complete = [bytes, &[0, 0][..missing]].concat();
+        let complete = [bytes, &[0; ADDED][..missing]].concat();
         let (message, rest) = postcard::take_from_bytes::<KeyframeMessage>(&complete).ok()?;
-        // What was added stands for what is not there, and for nothing else.
-        let is_so = rest.is_empty() && message.place.is_none() && (missing == 1 || message.landmarks.is_empty());
+        // What was added stands for what is not there, and for nothing else. The last addition comes first.
+        let m = &message;
+        let nothing: [bool; ADDED] = [!m.organised, m.depth.is_none(), m.place.is_none(), m.landmarks.is_empty()];
+        let is_so = rest.is_empty() && nothing.iter().take(missing).all(|nothing| *nothing);
         is_so.then_some(message)
     };
-    completed(1).or_else(|| completed(2))
+    (1..=ADDED).find_map(completed)
 }
 
 /// Decodes and checks a sighting.
@@ -240,10 +300,19 @@ fn decode<T: DeserializeOwned>(format: Format, bytes: &[u8]) -> Result<T, Observ
 
 impl TryFrom<KeyframeMessage> for Keyframe {
     type Error = ObservationError;
-    fn try_from(message: KeyframeMessage) -> Result<Self, ObservationError> {
+    fn try_from(mut message: KeyframeMessage) -> Result<Self, ObservationError> {
         let pose = pose(&message.translation, message.rotation, &message.covariance)?;
         if message.points.len() > POINTS_MAX {
             return Err(ObservationError::Points(message.points.len()));
+        }
+        if let Some(depth) = &message.depth {
+            if !message.points.is_empty() {
+                return Err(ObservationError::Both);
+            }
+            message.points = depth.points()?;
+        }
+        if message.organised {
+            measured(&mut message)?;
         }
         if !message.points.iter().flatten().all(|&x| sane(f64::from(x))) {
             return Err(ObservationError::Number("points"));
@@ -261,6 +330,21 @@ impl TryFrom<KeyframeMessage> for Keyframe {
         let stamp = Stamp(message.stamp_ns);
         Ok(Self { stamp, pose, covariance_of: message.covariance_of, points: message.points, marks, place })
     }
+}
+
+/// Leaves the points of an organised cloud out where nothing was measured.
+fn measured(message: &mut KeyframeMessage) -> Result<(), ObservationError> {
+    if !message.landmarks.is_empty() {
+        return Err(ObservationError::OrganisedLandmarks);
+    }
+    let all = message.points.len();
+    message.points.retain(|point| point.iter().all(|x| x.is_finite()));
+    let left_out = all - message.points.len();
+    if message.points.is_empty() && all > 0 {
+        return Err(ObservationError::Unmeasured(all));
+    }
+    tracing::debug!(left_out, of = all, "nothing was measured at some points of an organised cloud");
+    Ok(())
 }
 
 /// Checks what is known of a landmark.
@@ -296,6 +380,8 @@ impl From<&Keyframe> for KeyframeMessage {
             points: keyframe.points.clone(),
             landmarks: keyframe.marks.iter().map(Into::into).collect(),
             place: keyframe.place.as_ref().map(Into::into),
+            depth: None,
+            organised: false,
         }
     }
 }

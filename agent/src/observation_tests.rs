@@ -14,6 +14,8 @@ fn message() -> KeyframeMessage {
         points: vec![[1.0, 2.0, 3.0], [-1.0, 0.5, 0.25]],
         landmarks: vec![],
         place: None,
+        depth: None,
+        organised: false,
     }
 }
 
@@ -53,21 +55,31 @@ fn a_place_travels_and_is_checked() {
     assert_eq!(serde_json::from_slice::<PlaceMessage>(written).unwrap().model, "");
 }
 
+/// What was added after the points, each a zero byte in a message that has none of it: organised, depth, place,
+/// landmarks, the last one first.
+const ADDED: usize = 4;
+
 #[test]
 fn what_was_sent_before_there_were_places_or_landmarks_is_understood() {
     let whole = |message: &KeyframeMessage| postcard::to_stdvec(message).unwrap();
     let of = |bytes: &[u8]| keyframe(Format::Postcard, bytes);
     let (plain, marked, placed) = (whole(&message()), whole(&of_landmarks()), whole(&of_a_place()));
-    assert!(plain.ends_with(&[0, 0]) && marked.ends_with(&[0]));
-    for missing in [1, 2] {
+    assert!(plain.ends_with(&[0; ADDED]) && marked.ends_with(&[0; ADDED - 1]) && placed.ends_with(&[0; ADDED - 2]));
+    for missing in 1..=ADDED {
         assert_eq!(of(&plain[..plain.len() - missing]), of(&plain));
     }
-    assert_eq!(of(&marked[..marked.len() - 1]), of(&marked));
+    for missing in 1..ADDED {
+        assert_eq!(of(&marked[..marked.len() - missing]), of(&marked));
+    }
+    for missing in 1..ADDED - 1 {
+        assert_eq!(of(&placed[..placed.len() - missing]), of(&placed));
+    }
     // Anything shorter was cut.
-    for (bytes, known) in [(&plain, plain.len() - 2), (&marked, marked.len() - 1), (&placed, placed.len())] {
+    for (bytes, added) in [(&plain, ADDED), (&marked, ADDED - 1), (&placed, ADDED - 2)] {
         // Up to the end of its points or of no landmarks, it is a plain one.
-        let is_plain = |len: usize| (plain.len() - 2..plain.len()).contains(&len) && plain.starts_with(&bytes[..len]);
-        for len in (0..known).filter(|&len| !is_plain(len)) {
+        let is_plain =
+            |len: usize| (plain.len() - ADDED..plain.len()).contains(&len) && plain.starts_with(&bytes[..len]);
+        for len in (0..bytes.len() - added).filter(|&len| !is_plain(len)) {
             assert!(of(&bytes[..len]).is_err(), "cut to {len} of {}", bytes.len());
         }
     }
@@ -138,6 +150,32 @@ fn decoding_takes_the_whole_input_and_known_fields_alone() {
     let mut json = serde_json::to_value(message()).unwrap();
     json["colour"] = 1.into();
     assert!(matches!(keyframe(Format::Json, json.to_string().as_bytes()), Err(ObservationError::Json(_))));
+}
+
+#[test]
+fn organised_clouds_leave_out_what_was_not_measured_and_others_are_refused_for_it() {
+    let holes = [[f32::NAN; 3], [1.0, 2.0, f32::NAN], [f32::INFINITY, 0.0, 0.0], [0.0, f32::NEG_INFINITY, 0.0]];
+    let mut cloud = KeyframeMessage { organised: true, ..message() };
+    cloud.points.splice(1..1, holes);
+    let taken = keyframe(Format::Postcard, &postcard::to_stdvec(&cloud).unwrap()).unwrap();
+    assert_eq!(taken.points, message().points);
+    let as_it_is = KeyframeMessage { organised: false, ..cloud.clone() };
+    assert_eq!(Keyframe::try_from(as_it_is), Err(ObservationError::Number("points")));
+    let empty = KeyframeMessage { points: holes.to_vec(), ..cloud.clone() };
+    assert_eq!(Keyframe::try_from(empty), Err(ObservationError::Unmeasured(4)));
+    let far = KeyframeMessage { points: vec![[2e7, 0.0, 0.0]], ..cloud };
+    assert_eq!(Keyframe::try_from(far), Err(ObservationError::Number("points")));
+    let marked = KeyframeMessage { organised: true, ..of_landmarks() };
+    assert_eq!(Keyframe::try_from(marked), Err(ObservationError::OrganisedLandmarks));
+}
+
+#[test]
+fn a_keyframe_that_saw_nothing_says_so() {
+    let mut json = serde_json::to_value(message()).unwrap();
+    json["points"] = serde_json::json!([]);
+    assert!(keyframe(Format::Json, json.to_string().as_bytes()).unwrap().points.is_empty());
+    json.as_object_mut().unwrap().remove("points");
+    assert_eq!(keyframe(Format::Json, json.to_string().as_bytes()), Err(ObservationError::Neither));
 }
 
 #[test]

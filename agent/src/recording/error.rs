@@ -173,7 +173,10 @@ pub enum Problem {
     #[error("the file has {0} bytes; at most {CLOUD_BYTES_MAX} (CLOUD_BYTES_MAX) are read: thin the cloud")]
     CloudBytes(u64),
     /// A point is NaN, infinite or absurdly far.
-    #[error("point {0} (counted from 0) is not finite or beyond {COORDINATE_MAX:e} m; leave invalid returns out")]
+    #[error(
+        "point {0} (counted from 0) is not finite or beyond {COORDINATE_MAX:e} m; leave invalid returns \
+         out, or write a PCD of more than one row, where NaN stands for nothing measured"
+    )]
     Point(usize),
     /// A PLY file is not as expected.
     #[error("{0}")]

@@ -7,12 +7,12 @@ use super::cloud::{read_bytes, read_text};
 use super::error::{Problem, RecordingError, on};
 use super::import::{Cut, Scan};
 use super::table::{near, number};
+use crate::depth::{Camera, Counts, DepthError, DepthImage};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::{Se3, So3};
 use merganser_protocol::time::Stamp;
 use nalgebra::{Matrix3, Matrix4, Vector3};
 use std::collections::BTreeMap;
-use std::io::Cursor;
 use std::path::Path;
 
 /// How the depth images' names end.
@@ -20,14 +20,12 @@ pub(super) const DEPTH_SUFFIX: &str = ".depth.png";
 const DEPTH_PREFIX: &str = "frame-";
 const INTRINSICS: &str = "camera-intrinsics.txt";
 const POSES: &str = "poses_all_1000.txt";
-/// Depth used, mm: nearer is noise, farther is coarse.
-const DEPTH_MM: std::ops::RangeInclusive<u16> = 300..=4000;
-/// Pixels of a depth image at most: a header must not make us allocate what no camera fills.
-const PIXELS_MAX: u64 = 1 << 24;
+/// What one count is, m.
+const UNIT_M: f64 = 1e-3;
+/// Depth used, m: nearer is noise, farther is coarse.
+const RANGE_M: [f64; 2] = [0.3, 4.0];
 /// Every so many pixels of every so many rows.
 const STRIDE: usize = 6;
-/// A camera's focal length by the width, or height, of its image: from a fish eye to a telescope.
-const FOCAL_BY_SIZE: std::ops::RangeInclusive<f64> = 0.1..=10.0;
 /// The camera's rate.
 const FRAME_NANOS: i64 = 1_000_000_000 / 30;
 /// A hand-held visual SLAM's: 1 % of the way and a tenth of a degree on each axis per keyframe (a third of a second).
@@ -62,22 +60,6 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
     let origin = format!("7-Scenes RGB-D, {} depth images cut into three robots by thirds", scans.len());
     let cut = Cut { robots: 3, sensor: "depth", origin, drift: DRIFT, seed, config };
     cut.write(&scans, out, |scan| read_depth(&scan.source, &camera))
-}
-
-/// Focal lengths and principal point, pixels.
-struct Camera {
-    fx: f64,
-    fy: f64,
-    cx: f64,
-    cy: f64,
-}
-
-impl Camera {
-    /// Whether it can have taken an image of so many pixels.
-    fn takes(&self, width: f64, height: f64) -> bool {
-        let one = |f: f64, c: f64, size: f64| FOCAL_BY_SIZE.contains(&(f / size)) && (0.0..=size).contains(&c);
-        one(self.fx, self.cx, width) && one(self.fy, self.cy, height)
-    }
 }
 
 fn read_intrinsics(path: &Path) -> Result<Camera, RecordingError> {
@@ -134,38 +116,10 @@ pub(super) fn rigid(m: &Matrix4<f64>) -> Result<Se3, Problem> {
 /// The points of a depth image, in the camera's frame.
 fn read_depth(path: &Path, camera: &Camera) -> Result<Vec<[f32; 3]>, RecordingError> {
     let bytes = read_bytes(path)?;
-    let told = |error: png::DecodingError| Problem::Image(error.to_string()).of(path);
-    let mut reader = png::Decoder::new(Cursor::new(bytes)).read_info().map_err(told)?;
-    let (width, kind) = (reader.info().width as usize, reader.output_color_type());
-    if u64::from(reader.info().width) * u64::from(reader.info().height) > PIXELS_MAX {
-        return Err(Problem::Image(format!("a depth image has at most {PIXELS_MAX} pixels")).of(path));
-    }
-    let size = reader.output_buffer_size().filter(|_| kind == (png::ColorType::Grayscale, png::BitDepth::Sixteen));
-    let Some(size) = size else {
-        return Err(Problem::Image(format!("a depth image is 16-bit grey, not {kind:?}")).of(path));
-    };
-    let Camera { fx, fy, cx, cy } = *camera;
-    let height = reader.info().height as usize;
-    if !camera.takes(width as f64, height as f64) {
-        let why = format!(
-            "no camera of focal lengths {fx} and {fy} and principal point {cx}, {cy} takes an image of {width} × {height} \
-             pixels; check {INTRINSICS}"
-        );
-        return Err(Problem::Image(why).of(path));
-    }
-    let mut pixels = vec![0; size];
-    reader.next_frame(&mut pixels).map_err(told)?;
-    let (pixels, _) = pixels.as_chunks::<2>();
-    let mut points = Vec::new();
-    for (v, row) in pixels.chunks_exact(width).enumerate().step_by(STRIDE) {
-        for (u, pixel) in row.iter().enumerate().step_by(STRIDE) {
-            let depth = u16::from_be_bytes(*pixel);
-            if DEPTH_MM.contains(&depth) {
-                let z = f64::from(depth) * 1e-3;
-                let (x, y) = ((u as f64 - cx) / fx * z, (v as f64 - cy) / fy * z);
-                points.push([x as f32, y as f32, z as f32]);
-            }
-        }
-    }
-    if points.is_empty() { Err(Problem::CloudEmpty.of(path)) } else { Ok(points) }
+    let seen = || DepthImage::from_png(&bytes)?.points(camera, &Counts::new(UNIT_M, Some(RANGE_M))?, STRIDE);
+    seen().map_err(|error| match error {
+        DepthError::Nothing { .. } => Problem::CloudEmpty.of(path),
+        DepthError::Camera { .. } => Problem::Image(format!("{error}; check {INTRINSICS}")).of(path),
+        _ => Problem::Image(error.to_string()).of(path),
+    })
 }

@@ -1,5 +1,6 @@
 //! PCD clouds through `pcd-rs`. What the header claims is checked against the file before that library sees it, since
-//! it allocates what a header asks for.
+//! it allocates what a header asks for. An organised cloud (of more than one row) keeps its sensor's grid, with NaN or
+//! infinity where nothing was measured: such points are left out. In any other they are a mistake.
 
 use super::cloud::bounded;
 use super::error::Problem;
@@ -18,6 +19,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Vec<[f32; 3]>, Problem> {
     check_length(&meta, body, count)?;
     let columns = columns(&meta)?;
     let reader = DynReader::from_bytes(bytes).map_err(told)?;
+    let is_organised = meta.height > 1;
     let mut points = Vec::with_capacity(count);
     for record in reader {
         let fields = record.map_err(told)?.0;
@@ -29,7 +31,12 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Vec<[f32; 3]>, Problem> {
                 _ => return Err(Problem::Pcd("the fields x, y, z must be floats".into())),
             };
         }
-        points.push(point);
+        if !is_organised || point.iter().all(|c| c.is_finite()) {
+            points.push(point);
+        }
+    }
+    if points.len() < count && is_organised {
+        tracing::debug!(left_out = count - points.len(), of = count, "nothing was measured at some points of a PCD");
     }
     Ok(points)
 }
@@ -118,6 +125,28 @@ mod tests {
             let points = parse(&written(kind, 40)).unwrap();
             assert_eq!(points.len(), 40, "{kind:?}");
             assert_eq!(points[3], [3.0, -3.0, 0.25], "{kind:?}");
+        }
+    }
+
+    #[test]
+    fn organised_clouds_leave_out_what_was_not_measured() {
+        let cloud = |width: usize, height: usize| {
+            let head = format!(
+                "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {width}\nHEIGHT {height}\n\
+                 VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {}\nDATA ",
+                width * height
+            );
+            let points = [[f32::NAN; 3], [1.0, 2.0, 3.0], [4.0, 5.0, f32::NAN], [f32::INFINITY, 0.0, 0.0]];
+            let binary: Vec<u8> = points.iter().flatten().flat_map(|c| c.to_le_bytes()).collect();
+            let ascii = "nan nan nan\n1 2 3\n4 5 nan\ninf 0 0\n";
+            [[format!("{head}binary\n").into_bytes(), binary].concat(), format!("{head}ascii\n{ascii}").into_bytes()]
+        };
+        for bytes in cloud(2, 2) {
+            assert_eq!(parse(&bytes).unwrap(), [[1.0, 2.0, 3.0]]);
+        }
+        for bytes in cloud(4, 1) {
+            let points = parse(&bytes).unwrap();
+            assert!(points.len() == 4 && points[0][0].is_nan(), "left to be refused as a mistake");
         }
     }
 
