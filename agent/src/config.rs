@@ -16,6 +16,9 @@ use thiserror::Error;
 const FILE_LEN_MAX: u64 = 1 << 20;
 /// Zenoh's own bound on a batch: a message must be allowed to be at least this large.
 const MESSAGE_BYTES_MIN: usize = 65_536;
+/// Room for a keyframe of [`POINTS_MAX`](crate::observation::POINTS_MAX) points, of 12 bytes each in postcard, or for a
+/// depth image of 1920 × 1080 pixels, in JSON too.
+const INPUT_BYTES_MAX: usize = 6 << 20;
 /// Largest message bound accepted; the largest answer a peer gives is far below it.
 const MESSAGE_BYTES_MAX: usize = 16 << 20;
 
@@ -114,8 +117,12 @@ pub struct ZenohConfig {
     pub input_interfaces: Vec<String>,
     /// Silence after which a link counts as lost. A partition shorter than this loses no message.
     pub lease_secs: f64,
-    /// Largest message accepted from a link.
+    /// Largest message accepted from a peer.
     pub message_bytes_max: usize,
+    /// Largest message accepted from the robot's own SLAM, in bytes. Zenoh drops what is larger by more than a little
+    /// without a word, and has but one bound for all links: while pieces of a message come in, a hostile neighbour can
+    /// make the agent hold sixteen times this (eight priorities, two reliabilities).
+    pub input_bytes_max: usize,
     /// Longest wait for the session to close at the end.
     pub close_secs: f64,
 }
@@ -132,6 +139,7 @@ impl Default for ZenohConfig {
             input_interfaces: vec!["lo".into(), "lo0".into()],
             lease_secs: 10.0,
             message_bytes_max: 1 << 20,
+            input_bytes_max: INPUT_BYTES_MAX,
             close_secs: 3.0,
         }
     }
@@ -348,6 +356,7 @@ impl ZenohConfig {
         let bytes = self.message_bytes_max as f64;
         let (low, high) = (MESSAGE_BYTES_MIN as f64, MESSAGE_BYTES_MAX as f64);
         within("zenoh.message_bytes_max", bytes, low, high, "use 65536 to 16777216 bytes")?;
+        within("zenoh.input_bytes_max", self.input_bytes_max as f64, low, high, "use 65536 to 16777216 bytes")?;
         within("zenoh.lease_secs", self.lease_secs, 0.5, 600.0, "use 0.5 to 600 s")?;
         within("zenoh.close_secs", self.close_secs, 0.1, 60.0, "use 0.1 to 60 s")?;
         if self.input_interfaces.is_empty() {

@@ -165,12 +165,17 @@ pub struct Drops(Mutex<BTreeMap<String, Arc<AtomicU64>>>);
 impl Drops {
     /// Counts one.
     pub fn count(&self, reason: impl Into<String>) {
+        self.count_first(reason);
+    }
+
+    /// Counts one; whether it is the first that is counted for this reason.
+    pub fn count_first(&self, reason: impl Into<String>) -> bool {
         let mut counters = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let mut reason = reason.into();
         if counters.len() >= REASONS_MAX && !counters.contains_key(&reason) {
             reason = "other".into();
         }
-        counters.entry(reason).or_default().fetch_add(1, Relaxed);
+        counters.entry(reason).or_default().fetch_add(1, Relaxed) == 0
     }
 
     /// All counters.
@@ -276,6 +281,8 @@ mod tests {
         }
         assert_eq!(drops.counts().len(), REASONS_MAX + 1);
         assert_eq!(drops.counts()["other"], 1000 - REASONS_MAX as u64);
+        assert!(!drops.count_first("reason 0") && !drops.count_first("one more, counted as another"));
+        assert!(Drops::default().count_first("reason 0"));
         let mut seen = BTreeMap::new();
         assert_eq!(drops.news(&mut seen).len(), REASONS_MAX + 1);
         assert!(drops.news(&mut seen).is_empty());

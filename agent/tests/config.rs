@@ -44,6 +44,8 @@ fn each_mistake_gets_one_error_that_names_its_line() {
         (text("alpha", KEY, &format!("beta = \"{KEY}\"")), &["a.toml:6", "roster.beta", "same key as alpha"]),
         (text("alpha", KEY, "Ä = \"00\""), &["a.toml:6"]),
         (text("alpha", KEY, "[zenoh]\nlease_secs = nan"), &["a.toml:7", "zenoh.lease_secs", "0.5 to 600 s"]),
+        (text("alpha", KEY, "[zenoh]\ninput_bytes_max = 65535"), &["zenoh.input_bytes_max", "65536 to 16777216 bytes"]),
+        (text("alpha", KEY, "[zenoh]\ninput_bytes_max = 16777217"), &["a.toml:7", "zenoh.input_bytes_max"]),
         (text("alpha", KEY, "[zenoh]\nconnect = [\"7447\"]"), &["a.toml:7", "zenoh.connect", "no endpoint"]),
         (text("alpha", KEY, "[zenoh]\nmode = \"mesh\""), &["a.toml:7", "`mesh`", "`peer`"]),
         (
@@ -59,6 +61,15 @@ fn each_mistake_gets_one_error_that_names_its_line() {
         let said = error(text);
         assert!(wanted.iter().all(|part| said.contains(part)), "{said}\nwanted {wanted:?} from\n{text}");
         assert_eq!(said.lines().count(), 1, "{said}");
+    }
+}
+
+#[test]
+fn the_bounds_of_input_are_within_them() {
+    for bytes in [65_536, 16_777_216] {
+        let config =
+            FileConfig::parse(&text("alpha", KEY, &format!("[zenoh]\ninput_bytes_max = {bytes}")), Path::new("a"));
+        assert_eq!(config.unwrap().zenoh.input_bytes_max, bytes);
     }
 }
 

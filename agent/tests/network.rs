@@ -10,7 +10,7 @@ use merganser::driver::Clock;
 use merganser::host::Host;
 use merganser::keys;
 use merganser::link::session::{self, Role};
-use merganser::observation::KeyframeMessage;
+use merganser::observation::{KeyframeMessage, POINTS_MAX};
 use merganser::store;
 use merganser_protocol::agent::io::{Channel, Command, Input, Output, QueryId, QueryKind, Record};
 use merganser_protocol::ids::RobotId;
@@ -18,6 +18,7 @@ use merganser_protocol::snapshot::StatusView;
 use std::collections::BTreeMap;
 use std::time::Duration;
 use zenoh::Session;
+use zenoh::qos::CongestionControl;
 
 async fn puppet(config: &FileConfig, core: &Puppet) -> Host {
     let store = store::open(config).unwrap().store;
@@ -180,6 +181,39 @@ async fn the_robots_own_slam_feeds_it_in_json_and_postcard_from_this_host_alone(
     session::close(&session, PATIENCE).await;
     alpha.stop().await.unwrap();
     beta.stop().await.unwrap();
+}
+
+/// A full turn of a LiDAR is larger than what peers may send, and so is a depth image in JSON.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_largest_keyframe_arrives_and_a_larger_one_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let configs = swarm(dir.path(), &["alpha"]);
+    let core = Puppet::default();
+    let alpha = puppet(&configs[0], &core).await;
+    let session = onlooker(&configs[0]).await;
+    let send = async |bytes: Vec<u8>, encoding: &str| {
+        let key = keys::of(&name("test"), &name("alpha"), "in/keyframe");
+        session.put(key, bytes).encoding(encoding).congestion_control(CongestionControl::Block).await.unwrap();
+    };
+    let of = |points: usize| KeyframeMessage { points: vec![[1.0, 2.0, 3.0]; points], ..(&keyframe(0, 0)).into() };
+    let counted = |reason: &str| alpha.inbox().drops.counts().keys().any(|counted| counted.contains(reason));
+    until("the way to alpha", async || {
+        send(b"hello".to_vec(), "text/plain").await;
+        counted("neither application/json nor")
+    })
+    .await;
+    let heard = |points: usize| {
+        core.has_heard(|input| matches!(input, Input::Keyframe(keyframe) if keyframe.points.len() == points))
+    };
+    send(postcard::to_stdvec(&of(POINTS_MAX)).unwrap(), "application/octet-stream").await;
+    until("the largest keyframe", async || heard(POINTS_MAX)).await;
+    send(postcard::to_stdvec(&of(POINTS_MAX + 1)).unwrap(), "application/octet-stream").await;
+    until("the refusal of a point too many", async || counted("in/keyframe: too many points")).await;
+    send(vec![b' '; configs[0].zenoh.input_bytes_max + 1], "application/json").await;
+    until("the refusal of too many bytes", async || counted("in/keyframe: larger than zenoh.input_bytes_max")).await;
+    assert!(!heard(POINTS_MAX + 1));
+    session::close(&session, PATIENCE).await;
+    alpha.stop().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

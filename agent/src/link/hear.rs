@@ -87,6 +87,12 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
     let Some(format) = format_of(sample.encoding()) else {
         return shared.drops().count(format!("refused: in/{input} is neither application/json nor octet-stream"));
     };
+    let (length, limit) = (sample.payload().len(), shared.input_bytes_max);
+    if length > limit {
+        let reason =
+            format!("larger than zenoh.input_bytes_max = {limit}: raise it (to 16777216 at most) or thin the data");
+        return refuse(shared, input, &reason, &format!("{length} bytes, {reason}"));
+    }
     let bytes = sample.payload().to_bytes();
     let parsed = match input {
         "keyframe" => observation::keyframe(format, &bytes).map(Input::Keyframe),
@@ -98,9 +104,18 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
             shared.inbox.offer(Source::Own, observed);
         }
         Err(reason) => {
-            tracing::debug!(%reason, input, "refused input of our own SLAM");
-            shared.drops().count(format!("refused: in/{input}: {}", first_words(&reason.to_string())));
+            let reason = reason.to_string();
+            refuse(shared, input, first_words(&reason), &reason);
         }
+    }
+}
+
+/// Counts an input of our own SLAM that is refused, and tells the whole story of the first of each kind.
+fn refuse(shared: &Shared, input: &str, kind: &str, reason: &str) {
+    if shared.drops().count_first(format!("refused: in/{input}: {kind}")) {
+        tracing::warn!(input, reason, "refused what our own SLAM sent; the next ones of this kind are only counted");
+    } else {
+        tracing::debug!(input, reason, "refused what our own SLAM sent");
     }
 }
 

@@ -50,6 +50,10 @@ struct Shared {
     names: BTreeMap<RobotId, Name>,
     questions: Mutex<BTreeMap<AskToken, (QueryKind, Query)>>,
     answering: Arc<Semaphore>,
+    /// Largest message of the robot's own SLAM.
+    input_bytes_max: usize,
+    /// Largest answer of a peer.
+    message_bytes_max: usize,
 }
 
 /// The way out, for the driver.
@@ -74,6 +78,8 @@ impl Link {
             ids,
             questions: Mutex::default(),
             answering: Arc::new(Semaphore::new(ANSWERS_MAX)),
+            input_bytes_max: config.zenoh.input_bytes_max,
+            message_bytes_max: config.zenoh.message_bytes_max,
         });
         let outgoing = say::start(shared.clone(), Duration::from_secs_f64(config.core.gossip.answer_secs))?;
         let opened = Opened { shared: shared.clone(), config: config.clone() };

@@ -87,7 +87,8 @@ fn send_all(
 }
 
 fn ask(shared: &Shared, query: QueryId, peer: RobotId, kind: QueryKind, bytes: Vec<u8>, wait: Duration) {
-    let outcome = Outcome { query, shared_inbox: shared.inbox.clone(), open: Mutex::new(true) };
+    let bytes_max = shared.message_bytes_max;
+    let outcome = Outcome { query, bytes_max, shared_inbox: shared.inbox.clone(), open: Mutex::new(true) };
     let Some(name) = shared.names.get(&peer) else {
         return shared.drops().count("not asked: nobody in the roster has this id"); // `outcome` says so to the core
     };
@@ -113,6 +114,7 @@ fn ask(shared: &Shared, query: QueryId, peer: RobotId, kind: QueryKind, bytes: V
 /// without one (nobody there, refused, too late).
 struct Outcome {
     query: QueryId,
+    bytes_max: usize,
     shared_inbox: crate::queue::Inbox,
     open: Mutex<bool>,
 }
@@ -120,6 +122,10 @@ struct Outcome {
 impl Outcome {
     fn take(&self, reply: &Reply) {
         if let Ok(sample) = reply.result() {
+            if sample.payload().len() > self.bytes_max {
+                let reason = "refused: an answer larger than zenoh.message_bytes_max";
+                return self.shared_inbox.drops.count(reason);
+            }
             self.settle(Some(sample.payload().to_bytes().into_owned()));
         }
     }

@@ -12,6 +12,9 @@ use zenoh::{Config, Session};
 /// Longest wait for a session to open.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(15);
 
+/// Room for Zenoh's own fields, and for what is told to be too large instead of dropped in silence.
+const INPUT_SLACK_BYTES: usize = 1 << 16;
+
 /// Why Zenoh does not serve.
 #[derive(Debug, Error)]
 pub enum LinkError {
@@ -102,7 +105,7 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
         ("scouting/gossip/enabled", json!(config.gossip)),
         ("scouting/gossip/autoconnect_strategy", strategy(role)),
         ("transport/link/tx/lease", json!((config.lease_secs * 1e3) as u64)),
-        ("transport/link/rx/max_message_size", json!(config.message_bytes_max)),
+        ("transport/link/rx/max_message_size", json!(message_bytes_max(config, role))),
         ("transport/shared_memory/enabled", json!(false)),
         ("access_control", access(&config.input_interfaces)),
     ] {
@@ -113,6 +116,15 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
         })?;
     }
     Ok(settings)
+}
+
+/// Zenoh has one bound for all links, and drops what exceeds it without a word. So it lets in what the robot's own SLAM
+/// may send, and a little more, of which we can tell that it is too much; what peers send is measured when it is whole.
+fn message_bytes_max(config: &ZenohConfig, role: Role) -> usize {
+    match role {
+        Role::Robot => config.message_bytes_max.max(config.input_bytes_max + INPUT_SLACK_BYTES),
+        Role::Onlooker => config.message_bytes_max,
+    }
 }
 
 /// An error of Zenoh without the places in its sources (` at /…/endpoint.rs:615.`), which help no user.
@@ -202,7 +214,12 @@ mod tests {
             let settings = settings(&ZenohConfig { mode, ..config.clone() }, role).unwrap();
             let connect = settings.get_json("connect/endpoints").unwrap();
             assert!(connect.contains("7002") && !connect.contains("7001"), "{connect}");
-            assert_eq!(settings.get_json("transport/link/rx/max_message_size").unwrap(), "1048576");
+            assert_eq!(settings.get_json("transport/link/rx/max_message_size").unwrap(), "6356992");
         }
+        let bound =
+            |config: &ZenohConfig, role| settings(config, role).unwrap().get_json("transport/link/rx/max_message_size");
+        assert_eq!(bound(&config, Role::Onlooker).unwrap(), "1048576", "nobody feeds an onlooker");
+        config.input_bytes_max = 1 << 16;
+        assert_eq!(bound(&config, Role::Robot).unwrap(), "1048576", "what peers may send, at least");
     }
 }
