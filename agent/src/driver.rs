@@ -340,6 +340,11 @@ fn tell(event: &Event) {
         Event::Condensed { frame, parts, submaps_gone, bytes: [before, after] } => {
             info!(%frame, parts, submaps_gone, before, after, "log condensed");
         }
+        Event::ViewsDisagree { frame, misfit_voxels } => warn!(
+            %frame,
+            misfit_voxels,
+            "views of one submap do not fit together: check the camera's intrinsics, units, extrinsics and the odometry"
+        ),
         Event::SubmapFinished { submap, keypoints } => info!(%submap, keypoints, "submap finished"),
         Event::AlignmentAgreed { i, j } => info!(%i, %j, "alignment agreed"),
         Event::AlignmentDisputed { i, j } => warn!(%i, %j, "alignment disputed"),

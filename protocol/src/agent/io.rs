@@ -329,4 +329,12 @@ pub enum Event {
         /// Its frame.
         frame: FrameId,
     },
+    /// The views within our submaps do not fit together where our SLAM put them, the median over several submaps: its
+    /// intrinsics, unit, extrinsics or odometry are wrong. Told once a frame.
+    ViewsDisagree {
+        /// Our frame.
+        frame: FrameId,
+        /// How far points of one view lie off the surfaces of another, voxels.
+        misfit_voxels: f64,
+    },
 }

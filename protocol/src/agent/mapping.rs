@@ -119,6 +119,9 @@ impl Agent {
     }
 
     fn enqueue(&mut self, closed: Option<Submap>) {
+        if let Some(misfit_voxels) = self.mapper.builder.take_misfit() {
+            self.event(Event::ViewsDisagree { frame: self.me.frame, misfit_voxels });
+        }
         if let Some(submap) = closed {
             let id = SubmapId { frame: self.me.frame, index: submap.index };
             self.mapper.queue.push_back((id, submap));

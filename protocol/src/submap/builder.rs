@@ -7,6 +7,7 @@
 //! from the middle one only w/12; the joint estimate reckons with that (see [`distortion`](crate::estimate::distortion)).
 
 use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
+use super::misfit::{Misfits, Views};
 use super::odometry::{across_gap_after, isotropic, motion};
 use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
@@ -149,6 +150,8 @@ pub struct SubmapBuilder {
     /// Where the body is: as the SLAM has it, or a laser's scans.
     t_frame_body: Se3,
     sharpener: Sharpener,
+    misfits: Misfits,
+    misfit: Option<f64>,
 }
 
 #[derive(Clone, Debug)]
@@ -165,6 +168,7 @@ struct Open {
     cloud: Thinner,
     landmarks: Gatherer,
     place: PlaceMean,
+    views: Views,
 }
 
 impl SubmapBuilder {
@@ -180,6 +184,8 @@ impl SubmapBuilder {
             gap: false,
             t_frame_body: Se3::identity(),
             sharpener: Sharpener::default(),
+            misfits: Misfits::default(),
+            misfit: None,
         }
     }
 
@@ -221,6 +227,7 @@ impl SubmapBuilder {
         let index = self.next_index;
         self.next_index = index.saturating_add(1);
         self.since_finished = Some(open.t_anchor_last());
+        self.misfit = self.misfits.take(open.views.misfit()).or(self.misfit);
         Some(open.close(index))
     }
 
@@ -229,6 +236,12 @@ impl SubmapBuilder {
     pub fn body_since_anchor(&self) -> Option<(u32, PoseWithCovariance, Stamp)> {
         let index = self.next_index.checked_sub(1)?;
         Some((index, self.since_finished?, self.last.as_ref()?.stamp))
+    }
+
+    /// How far, in voxels, the views of submaps are from fitting together where the SLAM put them: said once, when it is
+    /// so much that the intrinsics, the unit, the extrinsics or the odometry must be wrong. Only of depth cameras.
+    pub fn take_misfit(&mut self) -> Option<f64> {
+        self.misfit.take()
     }
 
     fn check(&self, keyframe: &Keyframe) -> Result<(), KeyframeError> {
@@ -324,6 +337,7 @@ impl SubmapBuilder {
                 cloud: Thinner::new(self.config.voxel_m, self.config.points_max),
                 landmarks: Gatherer::new(self.config.voxel_m, self.config.points_max),
                 place: PlaceMean::default(),
+                views: Views::default(),
             }
         });
         let t_first_body = open.t_frame_first.inverse() * t_frame_body;
@@ -341,6 +355,9 @@ impl SubmapBuilder {
         }
         if self.config.sensor.sees_landmarks() {
             return;
+        }
+        if self.config.sensor == Sensor::Points3d {
+            open.views.add(usize::from(position), &t_first_body, &keyframe.points, self.config.voxel_m);
         }
         let is_flat = self.config.sensor == Sensor::Laser2d;
         let height = |p: &[f32; 3]| if is_flat { [p[0], p[1], 0.0] } else { *p };

@@ -21,6 +21,7 @@ mod grid;
 mod hypotheses;
 pub mod landmarks;
 mod matching;
+mod misfit;
 mod near;
 mod odometry;
 pub mod place;

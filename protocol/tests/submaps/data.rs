@@ -48,16 +48,28 @@ pub fn place(config: &SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>) -> Pla
     place_drifted(config, keyframes, &truth)
 }
 
+/// What the builder says of how views fit together: each time it says something, in voxels.
+pub fn misfits(config: SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>) -> Vec<f64> {
+    let mut builder = SubmapBuilder::new(config);
+    let mut told = Vec::new();
+    for (k, (pose, points)) in keyframes.into_iter().enumerate() {
+        builder.push(keyframe(k, pose, points)).unwrap();
+        told.extend(builder.take_misfit());
+    }
+    told
+}
+
+fn keyframe(k: usize, pose: Se3, points: Vec<[f32; 3]>) -> Keyframe {
+    let pose = PoseWithCovariance { pose, covariance: Covariance::from_sigmas([0.01; 6]).unwrap() };
+    let (stamp, covariance_of) = (Stamp(k as i64 + 1), CovarianceOf::Motion);
+    Keyframe { stamp, pose, covariance_of, points, marks: Vec::new(), place: None }
+}
+
 /// A submap of keyframes at believed poses; the anchor is truly where the keyframe is that it was placed at.
 pub fn place_drifted(config: &SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>, truth: &[Se3]) -> Place {
     let mut builder = SubmapBuilder::new(SubmapConfig { keyframes_max: 10_000, ..config.clone() });
     for (k, (pose, points)) in keyframes.into_iter().enumerate() {
-        let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
-        let pose = PoseWithCovariance { pose, covariance };
-        let stamp = Stamp(k as i64 + 1);
-        builder
-            .push(Keyframe { stamp, pose, covariance_of: CovarianceOf::Motion, points, marks: Vec::new(), place: None })
-            .unwrap();
+        builder.push(keyframe(k, pose, points)).unwrap();
     }
     let submap = builder.flush().unwrap();
     let t_world_anchor = truth[submap.keyframes.iter().position(|t| t.log().amax() < 1e-9).unwrap()];
@@ -73,21 +85,31 @@ fn thread_cpu_ms() -> Option<f64> {
     Some(text.split_whitespace().next()?.parse::<f64>().ok()? * 1e-6)
 }
 
+/// Focal length of the camera of 7-Scenes, pixels.
+pub const FOCAL: f32 = 585.0;
+
 /// 7-Scenes: 10 submaps of 5 depth images each.
 pub fn seven_scenes(data: &Path) -> Set {
     let folder = data.join("rgbd_7scenes");
-    let poses: Vec<Se3> = fs::read_to_string(folder.join("poses_all_1000.txt"))
-        .unwrap()
-        .lines()
-        .map(numbers)
-        .map(|v| Se3::from_matrix(&Matrix4::from_row_slice(&v[1..17])))
-        .collect();
+    let poses = camera_poses(&folder);
     let config = config(Sensor::Points3d, 0.05, 5);
     let places = (0..1000).step_by(100).map(|first| {
         let frames = (first..first + 100).step_by(20);
-        place(&config, frames.map(|k| (poses[k], depth_points(&folder, k))).collect())
+        place(&config, frames.map(|k| (poses[k], depth_points(&folder, k, FOCAL))).collect())
     });
     Set { name: "7scenes", places: places.collect(), rotation_deg_max: 15.0, translation_max: 0.3 }
+}
+
+/// 7-Scenes as a robot has it whose camera is believed to have this focal length: three keyframes a second at true poses.
+pub fn believed_scenes(data: &Path, focal: f32) -> Vec<(Se3, Vec<[f32; 3]>)> {
+    let folder = data.join("rgbd_7scenes");
+    let poses = camera_poses(&folder);
+    (0..500).step_by(10).map(|k| (poses[k], depth_points(&folder, k, focal))).collect()
+}
+
+fn camera_poses(folder: &Path) -> Vec<Se3> {
+    let text = fs::read_to_string(folder.join("poses_all_1000.txt")).unwrap();
+    text.lines().map(numbers).map(|v| Se3::from_matrix(&Matrix4::from_row_slice(&v[1..17]))).collect()
 }
 
 /// KITTI 07: 5 scans, each a submap.
@@ -126,8 +148,8 @@ fn floats(bytes: &[u8], stride: usize) -> Vec<[f32; 3]> {
 }
 
 /// Every fourth pixel with a depth of 0.3 to 4 m.
-fn depth_points(folder: &Path, frame: usize) -> Vec<[f32; 3]> {
-    let (fx, fy, cx, cy) = (585.0, 585.0, 320.0, 240.0);
+fn depth_points(folder: &Path, frame: usize, focal: f32) -> Vec<[f32; 3]> {
+    let (cx, cy) = (320.0, 240.0);
     let file = fs::File::open(folder.join(format!("frame-{frame:06}.depth.png"))).unwrap();
     let mut reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
@@ -136,7 +158,7 @@ fn depth_points(folder: &Path, frame: usize) -> Vec<[f32; 3]> {
     let depths = pixels.as_chunks::<2>().0.iter().map(|b| f32::from(u16::from_be_bytes(*b)) / 1000.0);
     let points = depths.enumerate().filter(|(_, z)| *z > 0.3 && *z <= 4.0).step_by(4).map(|(k, z)| {
         let (u, v) = ((k % width) as f32, (k / width) as f32);
-        [(u - cx) * z / fx, (v - cy) * z / fy, z]
+        [(u - cx) * z / focal, (v - cy) * z / focal, z]
     });
     points.collect()
 }

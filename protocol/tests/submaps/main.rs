@@ -9,6 +9,7 @@ mod world;
 
 use data::{Place, Set};
 use measure::{Score, median, overlap, pairs, trial};
+use merganser_protocol::config::Sensor;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::submap::{RefineConfig, RefineError, refine};
 use nalgebra::Vector6;
@@ -32,6 +33,18 @@ fn rooms_seen_by_a_depth_camera_are_aligned_from_7_kb() {
         assert!(score.nees_mean() <= 6.0 && score.covered() >= 0.9);
         assert!(median(&score.sigma_metres) < 0.06 && median(&score.sigma_degrees) < 2.0);
     }
+}
+
+/// Half the focal length is no mistake that the image itself could tell.
+#[test]
+fn a_camera_of_another_lens_is_told_from_the_right_one() {
+    let Some(data) = data::shared() else { return };
+    let told = |focal| data::misfits(data::config(Sensor::Points3d, 0.05, 5), data::believed_scenes(&data, focal));
+    assert_eq!(told(data::FOCAL), Vec::<f64>::new());
+    for focal in [1200.0, 400.0, 300.0] {
+        println!("focal length {focal} instead of {}: views {:.2?} voxels apart", data::FOCAL, told(focal));
+    }
+    assert_eq!(told(300.0).len(), 1, "once");
 }
 
 #[test]
