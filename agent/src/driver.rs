@@ -292,7 +292,7 @@ impl<C: Core, N: Network> Driver<C, N> {
     fn journalled(&mut self, now: Instant, input: Input) -> Option<Input> {
         let stored = StoredInput::from(&input);
         let input = match &stored {
-            StoredInput::Keyframe(message) => match Keyframe::try_from(message.clone()) {
+            StoredInput::Keyframe(message) => match Keyframe::try_from((**message).clone()) {
                 Ok(keyframe) => Input::Keyframe(keyframe),
                 Err(reason) => {
                     warn!(%reason, "keyframe refused: it cannot be written to the journal");

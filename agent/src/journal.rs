@@ -112,7 +112,7 @@ impl From<StoredRecord> for Record {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum StoredInput {
     /// See [`Input::Keyframe`].
-    Keyframe(KeyframeMessage),
+    Keyframe(Box<KeyframeMessage>),
     /// See [`Input::Sighting`].
     Sighting(Sighting),
     /// See [`Input::Received`].
@@ -140,7 +140,7 @@ pub enum StoredInput {
 impl From<&Input> for StoredInput {
     fn from(input: &Input) -> Self {
         match input {
-            Input::Keyframe(keyframe) => Self::Keyframe(keyframe.into()),
+            Input::Keyframe(keyframe) => Self::Keyframe(Box::new(keyframe.into())),
             Input::Sighting(sighting) => Self::Sighting(sighting.clone()),
             Input::Received { from, channel, bytes } => Self::Received(*from, *channel, bytes.clone()),
             Input::Asked { token, kind, bytes } => Self::Asked(*token, *kind, bytes.clone()),
@@ -172,7 +172,7 @@ impl StoredInput {
     /// [`ObservationError`] if a keyframe does not pass its checks: the journal was damaged.
     pub fn replayed(self) -> Result<Replayed, ObservationError> {
         Ok(Replayed::Input(Box::new(match self {
-            Self::Keyframe(message) => Input::Keyframe(message.try_into()?),
+            Self::Keyframe(message) => Input::Keyframe((*message).try_into()?),
             Self::Sighting(sighting) => Input::Sighting(sighting),
             Self::Received(from, channel, bytes) => Input::Received { from, channel, bytes },
             Self::Asked(token, kind, bytes) => Input::Asked { token, kind, bytes },

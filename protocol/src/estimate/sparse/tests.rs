@@ -126,8 +126,10 @@ fn a_pivot_that_is_not_positive_names_its_variable() {
     assert!(case.pattern.factorise(values.clone(), &mut Workspace::default()).is_err());
 }
 
+type Pairs = Vec<(usize, usize)>;
+
 /// A random pattern, as [`order::analyse`] takes it and as [`BlockPattern`] does.
-fn pattern(seed: u64) -> (Vec<usize>, Vec<Vec<usize>>, Vec<(usize, usize)>) {
+fn pattern(seed: u64) -> (Vec<usize>, Vec<Vec<usize>>, Pairs) {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     let sizes: Vec<usize> = (0..60).map(|_| rng.random_range(1..7)).collect();
     let mut below = vec![Vec::new(); sizes.len()];

@@ -194,7 +194,7 @@ impl Outcome<'_> {
         // Where both found the pair.
         let both: Vec<_> =
             theirs.clone().filter_map(|(t, peer)| Some((t.error.filter(|_| t.is_right)?, peer.error))).collect();
-        let of = |value: fn(&((f64, f64), (f64, f64))) -> f64| median(&both.iter().map(value).collect::<Vec<_>>());
+        let of = |value: fn(&Both) -> f64| median(&both.iter().map(value).collect::<Vec<_>>());
         writeln!(
             f,
             "to find {}: ours {}, theirs {}; median error where both do: ours {:.2}° and {:.3} m, theirs {:.2}° and \
@@ -235,6 +235,9 @@ impl Display for Outcome<'_> {
         self.compared(f)
     }
 }
+
+/// Rotation (°) and translation (m) off the truth: ours, and a peer's.
+type Both = ((f64, f64), (f64, f64));
 
 fn cost(f: &mut Formatter<'_>, name: &str, places: &[&Place]) -> Result {
     let of = |value: fn(&Place) -> f64| median(&places.iter().map(|place| value(place)).collect::<Vec<f64>>());
