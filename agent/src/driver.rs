@@ -336,7 +336,7 @@ fn tell(event: &Event) {
         Event::StoreHealed => warn!("the store works again; nothing was lost"),
         Event::Merged { frame } => info!(%frame, "merged"),
         Event::Unmerged { frame } => warn!(%frame, "no longer merged"),
-        Event::EpochBegan { frame } => info!(%frame, "a new epoch begins"),
+        Event::EpochBegan { frame, reason } => info!(%frame, reason = reason.text(), "a new epoch begins"),
         Event::Condensed { frame, parts, submaps_gone, bytes: [before, after] } => {
             info!(%frame, parts, submaps_gone, before, after, "log condensed");
         }

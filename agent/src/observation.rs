@@ -41,6 +41,22 @@
 //! `"organised": true` and such points are left out. Of any other cloud they are a mistake and refuse it. JSON has no NaN;
 //! there, leave the points out yourself.
 //!
+//! Poses are of an odometry frame: one in which the body moves and never jumps, however it drifts (`odom` in ROS's terms, not
+//! `map`). A SLAM that corrects its poses by loop closures sends them without the corrections, as the chain of motions from
+//! keyframe to keyframe: our joint estimate closes loops itself, and with a corrected pose it would take the correction for a
+//! motion. Small corrections (within `submap.distance_m`) pass unseen, and are as wrong as they are large; larger ones are
+//! refused, and if the SLAM stays there, a new epoch begins: a frame of its own, which merges with the old one by
+//! alignment. With `covariance_of = "pose"` the covariances of a chain are wanted, which do not shrink.
+//!
+//! `session` tells of which run of the SLAM a keyframe is: a number that is larger with each start, such as the time of it.
+//! Another one begins a new epoch at once, since what a SLAM that was reset to its origin says has nothing to do with what it
+//! said before. Without it a reset shows only by the jump, if that is longer than a few keyframes' way, and a few keyframes
+//! are lost. A message may do without (in postcard: end with its place).
+//!
+//! ```text
+//! "session": 1700000000
+//! ```
+//!
 //! A sighting of another robot states how it lies and is turned (`in/sighting`: `translation`, `rotation` and `covariance` of
 //! `t_body_other`, as in a keyframe); a range and a bearing, or a detection in an image of known depth, states where its
 //! body is alone (`in/position`), with the upper triangle of the 3×3 covariance, row by row:
@@ -103,6 +119,9 @@ pub struct KeyframeMessage {
     /// Whether points that are not finite stand for nothing measured.
     #[serde(default)]
     pub organised: bool,
+    /// Which run of the SLAM it is of, if it says: a number that is larger with each start.
+    #[serde(default)]
+    pub session: Option<u64>,
 }
 
 /// A place descriptor of the user's own.
@@ -258,13 +277,14 @@ fn states_points(json: &[u8]) -> bool {
 /// A postcard message that ends with its points or with what was added after them until some day: the rest was not known
 /// yet. Each addition is a zero byte where there is nothing of it.
 fn of_earlier_days(bytes: &[u8]) -> Option<KeyframeMessage> {
-    const ADDED: usize = 4;
+    const ADDED: usize = 5;
     let completed = |missing: usize| {
         let complete = [bytes, &[0; ADDED][..missing]].concat();
         let (message, rest) = postcard::take_from_bytes::<KeyframeMessage>(&complete).ok()?;
         // What was added stands for what is not there, and for nothing else. The last addition comes first.
         let m = &message;
-        let nothing: [bool; ADDED] = [!m.organised, m.depth.is_none(), m.place.is_none(), m.landmarks.is_empty()];
+        let nothing: [bool; ADDED] =
+            [m.session.is_none(), !m.organised, m.depth.is_none(), m.place.is_none(), m.landmarks.is_empty()];
         let is_so = rest.is_empty() && nothing.iter().take(missing).all(|nothing| *nothing);
         is_so.then_some(message)
     };
@@ -327,8 +347,8 @@ impl TryFrom<KeyframeMessage> for Keyframe {
         let marks = message.landmarks.iter().enumerate().map(mark).collect::<Result<_, _>>()?;
         let named = |place: PlaceMessage| PlaceDescriptor::new(&place.model, place.metric, place.vector);
         let place = message.place.map(named).transpose()?;
-        let stamp = Stamp(message.stamp_ns);
-        Ok(Self { stamp, pose, covariance_of: message.covariance_of, points: message.points, marks, place })
+        let KeyframeMessage { stamp_ns, covariance_of, points, session, .. } = message;
+        Ok(Self { stamp: Stamp(stamp_ns), session, pose, covariance_of, points, marks, place })
     }
 }
 
@@ -382,6 +402,7 @@ impl From<&Keyframe> for KeyframeMessage {
             place: keyframe.place.as_ref().map(Into::into),
             depth: None,
             organised: false,
+            session: keyframe.session,
         }
     }
 }

@@ -16,7 +16,12 @@ fn message() -> KeyframeMessage {
         place: None,
         depth: None,
         organised: false,
+        session: None,
     }
+}
+
+fn of_a_session() -> KeyframeMessage {
+    KeyframeMessage { session: Some(1_700_000_000), ..of_a_place() }
 }
 
 fn of_a_place() -> KeyframeMessage {
@@ -55,32 +60,43 @@ fn a_place_travels_and_is_checked() {
     assert_eq!(serde_json::from_slice::<PlaceMessage>(written).unwrap().model, "");
 }
 
-/// What was added after the points, each a zero byte in a message that has none of it: organised, depth, place,
+/// What was added after the points, each a zero byte in a message that has none of it: session, organised, depth, place,
 /// landmarks, the last one first.
-const ADDED: usize = 4;
+const ADDED: usize = 5;
 
 #[test]
-fn what_was_sent_before_there_were_places_or_landmarks_is_understood() {
+fn a_session_travels() {
+    let json = serde_json::to_vec(&of_a_session()).unwrap();
+    let postcard = postcard::to_stdvec(&of_a_session()).unwrap();
+    let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+    assert_eq!(a, b);
+    assert_eq!(a.session, Some(1_700_000_000));
+    assert_eq!(KeyframeMessage::from(&a).session, a.session);
+    let mut json = serde_json::to_value(message()).unwrap();
+    json["session"] = (-1).into();
+    assert!(matches!(keyframe(Format::Json, json.to_string().as_bytes()), Err(ObservationError::Json(_))));
+}
+
+#[test]
+fn what_was_sent_before_there_were_sessions_places_or_landmarks_is_understood() {
     let whole = |message: &KeyframeMessage| postcard::to_stdvec(message).unwrap();
     let of = |bytes: &[u8]| keyframe(Format::Postcard, bytes);
     let (plain, marked, placed) = (whole(&message()), whole(&of_landmarks()), whole(&of_a_place()));
+    let told = whole(&of_a_session());
     assert!(plain.ends_with(&[0; ADDED]) && marked.ends_with(&[0; ADDED - 1]) && placed.ends_with(&[0; ADDED - 2]));
-    for missing in 1..=ADDED {
-        assert_eq!(of(&plain[..plain.len() - missing]), of(&plain));
-    }
-    for missing in 1..ADDED {
-        assert_eq!(of(&marked[..marked.len() - missing]), of(&marked));
-    }
-    for missing in 1..ADDED - 1 {
-        assert_eq!(of(&placed[..placed.len() - missing]), of(&placed));
-    }
-    // Anything shorter was cut.
-    for (bytes, added) in [(&plain, ADDED), (&marked, ADDED - 1), (&placed, ADDED - 2)] {
-        // Up to the end of its points or of no landmarks, it is a plain one.
+    // Cut before what its session says, it is one of a place.
+    let is_placed = |bytes: &[u8], len: usize| {
+        (placed.len() - (ADDED - 2)..placed.len()).contains(&len) && placed.starts_with(&bytes[..len])
+    };
+    for (bytes, added) in [(&plain, ADDED), (&marked, ADDED - 1), (&placed, ADDED - 2), (&told, 0)] {
+        for missing in 1..=added {
+            assert_eq!(of(&bytes[..bytes.len() - missing]), of(bytes));
+        }
+        // Anything shorter was cut. Up to the end of its points or of no landmarks, it is a plain one.
         let is_plain =
             |len: usize| (plain.len() - ADDED..plain.len()).contains(&len) && plain.starts_with(&bytes[..len]);
         for len in (0..bytes.len() - added).filter(|&len| !is_plain(len)) {
-            assert!(of(&bytes[..len]).is_err(), "cut to {len} of {}", bytes.len());
+            assert!(of(&bytes[..len]).is_err() || is_placed(bytes, len), "cut to {len} of {}", bytes.len());
         }
     }
     for extra in [&[0][..], &[0, 0], &[1]] {

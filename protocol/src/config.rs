@@ -34,8 +34,16 @@ pub struct SubmapConfig {
     pub distance_m: f64,
     /// ...or turned this much...
     pub rotation_deg: f64,
-    /// ...or after this many keyframes.
+    /// ...or after this many keyframes...
     pub keyframes_max: u32,
+    /// ...or with the first keyframe so long after its first, unless the robot stood all the time: odometry that rests on
+    /// inertia drifts by the second.
+    pub secs_max: f64,
+    /// ...or before a motion with which the position along it would be known only to this standard deviation (the widest
+    /// axis): a cloud that is bent by more says little. Choose several times what the odometry gathers in `distance_m`...
+    pub sigma_max_m: f64,
+    /// ...or its rotation only to this.
+    pub sigma_max_deg: f64,
     /// Points kept per submap after thinning (memory bound).
     pub points_max: usize,
     /// Keypoints offered to others, 21 bytes each: 332 is 7.0 kB.
@@ -44,6 +52,12 @@ pub struct SubmapConfig {
     pub scale: crate::wire::fact::ScaleKind,
     /// Odometry standard deviation assumed across a gap in the keyframes, per metre travelled.
     pub gap_sigma_per_m: f64,
+    /// The fastest that the robot drives or flies. A keyframe farther than this lets it be is refused, and several that go on
+    /// from there begin a new epoch; within `distance_m` of the last one, none is. Twice the robot's top speed is a good
+    /// choice. Without effect where the scale is unknown: there, and besides, steps are held against those before.
+    pub speed_max_m_s: f64,
+    /// The fastest that it turns, likewise; within `rotation_deg`, none is refused.
+    pub turn_max_deg_s: f64,
 }
 
 impl Default for SubmapConfig {
@@ -54,10 +68,15 @@ impl Default for SubmapConfig {
             distance_m: 2.0,
             rotation_deg: 60.0,
             keyframes_max: 10,
+            secs_max: 120.0,
+            sigma_max_m: 2.0,
+            sigma_max_deg: 30.0,
             points_max: 20_000,
             keypoints: 332,
             scale: crate::wire::fact::ScaleKind::Metric,
             gap_sigma_per_m: 0.1,
+            speed_max_m_s: 50.0,
+            turn_max_deg_s: 360.0,
         }
     }
 }
@@ -243,9 +262,14 @@ impl Config {
         range("submap.distance_m", s.distance_m, 0.01, 1e4, "use 0.01 to 10000 m")?;
         range("submap.rotation_deg", s.rotation_deg, 1.0, 1e6, "use at least 1 degree")?;
         range("submap.keyframes_max", f64::from(s.keyframes_max), 1.0, 1e4, "use 1 to 10000")?;
+        range("submap.secs_max", s.secs_max, 1.0, 1e6, "use 1 to 1000000 s")?;
+        range("submap.sigma_max_m", s.sigma_max_m, 1e-3, 1e4, "use 0.001 to 10000 m")?;
+        range("submap.sigma_max_deg", s.sigma_max_deg, 0.01, 1e6, "use at least 0.01 degrees")?;
         range("submap.points_max", s.points_max as f64, 100.0, 1e6, "use 100 to 1000000 points")?;
         range("submap.keypoints", s.keypoints as f64, 16.0, 1024.0, "use 16 to 1024 keypoints")?;
         range("submap.gap_sigma_per_m", s.gap_sigma_per_m, 1e-4, 10.0, "use 0.0001 to 10")?;
+        range("submap.speed_max_m_s", s.speed_max_m_s, 0.01, 1e4, "use 0.01 to 10000 m/s")?;
+        range("submap.turn_max_deg_s", s.turn_max_deg_s, 1.0, 1e6, "use at least 1 degree per second")?;
         range("align.sigma_max_voxels", a.sigma_max_voxels, 0.1, 10.0, "use 0.1 to 10 voxels")?;
         range("align.log10_nfa_max", a.log10_nfa_max, -300.0, 0.0, "use a value from -300 to 0")?;
         range("align.support_min", a.support_min, 3.0, 1e4, "use at least 3")?;

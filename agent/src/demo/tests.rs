@@ -376,7 +376,10 @@ pub(super) fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             let stamp = Stamp((track.stamps_secs[index] * 1e9) as i64);
             let covariance_of = CovarianceOf::Motion;
             writer
-                .push(&Keyframe { stamp, pose, covariance_of, points, marks: vec![], place: None }, Some(truth))
+                .push(
+                    &Keyframe { stamp, session: None, pose, covariance_of, points, marks: vec![], place: None },
+                    Some(truth),
+                )
                 .unwrap();
         }
         writer.finish().unwrap();

@@ -34,6 +34,7 @@ fn of(depth: DepthMessage) -> KeyframeMessage {
         place: None,
         depth: Some(depth),
         organised: false,
+        session: None,
     }
 }
 

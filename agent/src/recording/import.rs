@@ -174,6 +174,7 @@ impl Cut<'_> {
                 let covariance_of = CovarianceOf::Motion;
                 let keyframe = Keyframe {
                     stamp: scan.stamp,
+                    session: None,
                     pose,
                     covariance_of,
                     points: points(scan)?,

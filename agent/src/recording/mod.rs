@@ -175,7 +175,7 @@ impl Recording {
             Some(format) => places::read(&self.folder.join(PLACES), format, index)?,
             None => None,
         };
-        Ok(Keyframe { stamp: line.stamp, pose: line.pose, covariance_of, points, marks, place })
+        Ok(Keyframe { stamp: line.stamp, session: None, pose: line.pose, covariance_of, points, marks, place })
     }
 
     fn line(&self, index: usize) -> Result<&KeyframeLine, RecordingError> {

@@ -112,6 +112,7 @@ mod tests {
                 stamp: Stamp(stamp),
                 pose: PoseWithCovariance { pose: Se3::identity(), covariance },
                 covariance_of: CovarianceOf::Motion,
+                session: None,
                 points: vec![[1.0; 3]],
                 marks: vec![],
                 place: place.clone(),

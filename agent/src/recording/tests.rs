@@ -36,6 +36,7 @@ fn write_good(folder: &Path, robot: &str) {
         let points = vec![[1.0, 2.0, 3.0 + i as f32]; 3];
         let keyframe = Keyframe {
             stamp: Stamp(1000 + i64::from(i)),
+            session: None,
             pose,
             covariance_of: CovarianceOf::Pose,
             points,

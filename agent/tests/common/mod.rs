@@ -165,6 +165,7 @@ pub fn keyframe(robot: u64, index: u64) -> Keyframe {
         stamp: Stamp(1_000_000_000 + index as i64 * 500_000_000),
         pose: PoseWithCovariance { pose: t_room_body, covariance },
         covariance_of: CovarianceOf::Motion,
+        session: None,
         points: points.collect(),
         marks: Vec::new(),
         place: None,

@@ -328,6 +328,8 @@ pub enum Event {
     EpochBegan {
         /// Its frame.
         frame: FrameId,
+        /// Why.
+        reason: EpochReason,
     },
     /// The views within our submaps do not fit together where our SLAM put them, the median over several submaps: its
     /// intrinsics, unit, extrinsics or odometry are wrong. Told once a frame.
@@ -337,4 +339,33 @@ pub enum Event {
         /// How far points of one view lie off the surfaces of another, voxels.
         misfit_voxels: f64,
     },
+}
+
+/// Why a new epoch begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EpochReason {
+    /// The operator or the shell said so.
+    Told,
+    /// Keyframes are of another session of the front end.
+    Session,
+    /// Keyframes go on from another place: the front end restarted or relocalised.
+    Jumped,
+    /// The stamps of keyframes went back, and stay there.
+    ClockBack,
+    /// The log must not be written on: it is damaged, or others hold more of it than we do, or has two histories.
+    Log,
+}
+
+impl EpochReason {
+    /// For people.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::Told => "it was told to",
+            Self::Session => "the front end's session is another one",
+            Self::Jumped => "the front end's poses jumped and go on elsewhere",
+            Self::ClockBack => "the clock of the keyframes went back",
+            Self::Log => "the log before is damaged, or others hold more of it",
+        }
+    }
 }

@@ -2,7 +2,7 @@
 //! that its own are written in. While it cannot write, it is receive-only.
 
 use super::Agent;
-use super::io::{Event, Output, Record};
+use super::io::{EpochReason, Event, Output, Record};
 use crate::ids::{EntryId, FrameId, Hash, RobotId};
 use crate::replica::{AppendError, IngestError, Ingested};
 use crate::wire::EntryBytes;
@@ -43,7 +43,7 @@ impl Agent {
             Err(error) => {
                 self.reject(Some(self.me.robot), "own fact", &error.to_string());
                 if matches!(error, AppendError::NewEpochNeeded(frame, _) if frame == self.me.frame) {
-                    self.begin_epoch(self.me.frame.epoch.saturating_add(1));
+                    self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::Log);
                 }
                 return false;
             }
@@ -114,7 +114,7 @@ impl Agent {
             return;
         }
         if epoch >= self.me.frame.epoch {
-            self.begin_epoch(epoch.saturating_add(1));
+            self.begin_epoch(epoch.saturating_add(1), EpochReason::Log);
         } else {
             self.ledger.open.push(Record::EpochClosed { epoch });
             self.tell_of_limit();
@@ -131,12 +131,12 @@ impl Agent {
 
     /// A new local frame begins: the trajectory so far is closed, for later runs as well, even if this one ends before
     /// the new epoch has an entry.
-    pub(super) fn begin_epoch(&mut self, epoch: u32) {
+    pub(super) fn begin_epoch(&mut self, epoch: u32, reason: EpochReason) {
         self.close_submap();
         self.me.frame.epoch = epoch;
         self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
         self.mapper.restart(&self.config.submap);
-        self.event(Event::EpochBegan { frame: self.me.frame });
+        self.event(Event::EpochBegan { frame: self.me.frame, reason });
         self.tell_of_limit();
     }
 

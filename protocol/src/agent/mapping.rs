@@ -1,12 +1,13 @@
 //! The robot's own side: keyframes in, submaps cut, described one at a time, and stated as facts in order.
 
 use super::Agent;
-use super::io::{Event, JobId, Record};
+use super::io::{EpochReason, Event, JobId, Record};
 use super::job::{DescribeJob, Job};
 use super::sighting::Twist;
 use crate::config::SubmapConfig;
 use crate::geometry::{PoseWithCovariance, Se3};
 use crate::ids::{Hash, SubmapId};
+use crate::submap::continuity::FrameSign;
 use crate::submap::{Described, Features, Keyframe, KeyframeError, Keypoints, Submap, SubmapBuilder};
 use crate::time::{Instant, Stamp};
 use crate::wire::fact::{Fact, SubmapFact};
@@ -92,8 +93,19 @@ impl Agent {
         }
         if self.mapper.queue.len() >= DESCRIBE_QUEUE_MAX {
             let detail = format!("{DESCRIBE_QUEUE_MAX} submaps wait to be described; raise submap.distance_m");
+            self.mapper.builder.pass(&keyframe);
             self.reject(Some(self.me.robot), "keyframe: overload", &detail);
             return;
+        }
+        if let Some(sign) = self.mapper.builder.another_frame(&keyframe) {
+            let reason = match sign {
+                FrameSign::Session => EpochReason::Session,
+                FrameSign::Jump => EpochReason::Jumped,
+            };
+            self.begin_epoch(self.me.frame.epoch.saturating_add(1), reason);
+            if let Some(error) = self.epoch_limit() {
+                return self.reject(Some(self.me.robot), "keyframe: receive-only", &error.to_string());
+            }
         }
         let (stamp, pose) = (keyframe.stamp, keyframe.pose.pose);
         match self.mapper.builder.push(keyframe) {
@@ -107,7 +119,7 @@ impl Agent {
                 self.reject(Some(self.me.robot), "keyframe", &error.to_string());
                 let is_behind = matches!(error, KeyframeError::StampNotRising { .. });
                 if is_behind && self.mapper.is_clock_back(self.now, stamp) {
-                    self.begin_epoch(self.me.frame.epoch.saturating_add(1));
+                    self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::ClockBack);
                 }
             }
         }

@@ -43,7 +43,7 @@ use allowance::Allowance;
 use condensing::Condensing;
 use ed25519_dalek::SigningKey;
 use gossip::Gossip;
-use io::{Command, Event, Input, JobId, Output, QueryId, Record};
+use io::{Command, EpochReason, Event, Input, JobId, Output, QueryId, Record};
 use job::{Job, JobResult};
 use knowledge::Knowledge;
 use ledger::Ledger;
@@ -206,7 +206,9 @@ impl Agent {
             Input::JobDone { job, result } => self.on_job_done(job, result),
             Input::Timeout => {}
             Input::Command(Command::Flush) => self.close_submap(),
-            Input::Command(Command::NewEpoch) => self.begin_epoch(self.me.frame.epoch.saturating_add(1)),
+            Input::Command(Command::NewEpoch) => {
+                self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::Told);
+            }
         }
         self.run_timers();
         self.start_describing();
@@ -283,7 +285,7 @@ impl Agent {
             closed = closed.max(damage.concerns(self.me.frame).then_some(self.me.frame.epoch));
         }
         if let Some(closed) = closed.filter(|closed| *closed >= self.me.frame.epoch) {
-            self.begin_epoch(closed.saturating_add(1).max(fresh_epoch));
+            self.begin_epoch(closed.saturating_add(1).max(fresh_epoch), EpochReason::Log);
         }
         self.relearn();
         // Only now it is known which are ours; of others as many are taken as there is room for.

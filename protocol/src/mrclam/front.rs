@@ -111,6 +111,7 @@ pub fn keyframes(speeds: &[Speed], sightings: &[Sighting]) -> Vec<Keyframe> {
             stamp: stamps[k],
             pose,
             covariance_of: CovarianceOf::Motion,
+            session: None,
             points,
             marks,
             place: None,

@@ -1,28 +1,28 @@
 //! Cuts a stream of keyframes into submaps. A submap ends with the keyframe that took the body `distance_m` or
-//! `rotation_deg` away from its first body pose, or that is its `keyframes_max`-th; the next keyframe begins the next
-//! one. The odometry between consecutive anchors compounds every motion in between, so that they chain without gaps.
+//! `rotation_deg` away from its first body pose, that is its `keyframes_max`-th, or that came `secs_max` after the first
+//! while the body did not merely stand; the next keyframe begins the next one. It ends before a motion that would let its
+//! last pose be uncertain by more than `sigma_max_m` or `sigma_max_deg`: so a hole in the odometry lies between submaps,
+//! where the joint estimate can mend it, and bends none. The odometry between consecutive anchors compounds every motion in between, so that they chain without gaps.
 //!
 //! A submap is anchored at its *middle* keyframe. Odometry that drifts bends the cloud, and what others align with is
 //! the cloud as a whole. For a random walk of variance w per submap the cloud's mean lies w/3 from the first body pose,
 //! from the middle one only w/12; the joint estimate reckons with that (see [`distortion`](crate::estimate::distortion)).
 
+use super::continuity::{Continuity, FrameSign};
 use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
 use super::misfit::{Misfits, Views};
 use super::odometry::{across_gap_after, isotropic, motion};
 use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
 use super::thinning::Thinner;
-use super::{Keyframe, Mark, PlaceDescriptor, PoseWithCovariance};
+use super::{Keyframe, KeyframeError, Mark, PlaceDescriptor, PoseWithCovariance};
 use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
-use thiserror::Error;
 
 /// Points in one keyframe at most: four times a dense depth image of 640×480.
 pub const POINTS_PER_KEYFRAME_MAX: usize = 1 << 20;
-/// Lengths of a submap (`distance_m`) that a body may move between two keyframes; more is another frame.
-pub const JUMP_SUBMAPS_MAX: f64 = 10.0;
 /// Farthest a body may be from its frame's origin, in frame units: beyond it f32 clouds and f64 poses lose accuracy.
 pub const POSITION_MAX: f64 = 1e7;
 /// Stamps lie within this of the clock's zero, ns (146 years): the span of any two then fits the wire.
@@ -55,84 +55,6 @@ pub struct Submap {
     pub place: Option<Place>,
 }
 
-/// Why a keyframe was refused. The builder is as it was before; only the odometry across the refused keyframe becomes
-/// less certain.
-#[derive(Clone, Debug, Error, PartialEq)]
-pub enum KeyframeError {
-    /// The stamp is not after the last one.
-    #[error("keyframe stamp {stamp} ns is not after the last one, {last} ns; send keyframes in order, once")]
-    StampNotRising {
-        /// The keyframe's stamp, ns.
-        stamp: i64,
-        /// The last accepted stamp, ns.
-        last: i64,
-    },
-    /// The stamp is farther than [`STAMP_MAX`] from the clock's zero.
-    #[error("keyframe stamp {stamp} ns is more than 146 years from zero; send nanoseconds")]
-    StampOutOfRange {
-        /// The keyframe's stamp, ns.
-        stamp: i64,
-    },
-    /// A translation is NaN, infinite or farther than [`POSITION_MAX`] from the origin.
-    #[error("keyframe position is not finite or beyond {POSITION_MAX} from the origin; use a local frame")]
-    BadPosition,
-    /// A planar robot's body is tilted.
-    #[error("the body is tilted by {tilt:.2} rad, more than {TILT_MAX}; is this a planar robot? See submap.sensor")]
-    NotPlanar {
-        /// Angle between the body's and the frame's upward axis, rad.
-        tilt: f64,
-    },
-    /// A coordinate of a point is NaN or infinite.
-    #[error("point {index} of the keyframe is not finite; leave out invalid returns")]
-    PointNotFinite {
-        /// Position in the keyframe's points.
-        index: usize,
-    },
-    /// Landmarks without marks, or marks of what are no landmarks.
-    #[error(
-        "keyframe has {points} points and {marks} marks; with submap.sensor = \"landmarks\" or \"landmarks_2d\" send a \
-         mark for each point, else none"
-    )]
-    Marks {
-        /// Points.
-        points: usize,
-        /// Marks.
-        marks: usize,
-    },
-    /// A landmark's covariance is out of range.
-    #[error(
-        "landmark {index} has a standard deviation outside 1e-6 to 1e4; state its covariance in frame units squared"
-    )]
-    MarkOutOfRange {
-        /// Position in the keyframe's points.
-        index: usize,
-    },
-    /// A place descriptor unlike those before.
-    #[error(
-        "the place vector has {numbers} numbers by {model:?}, unlike those before it; send one model, metric and length"
-    )]
-    OtherPlace {
-        /// Its numbers.
-        numbers: usize,
-        /// What made it.
-        model: String,
-    },
-    /// More points than a keyframe may hold.
-    #[error("keyframe has {count} points, at most {POINTS_PER_KEYFRAME_MAX} are accepted; thin it first")]
-    TooManyPoints {
-        /// How many it has.
-        count: usize,
-    },
-    /// The body moved farther than any motion: the SLAM was restarted or relocalised.
-    #[error("the body jumped by {moved:.1} since the last keyframe, more than {allowed:.1}; begin a new epoch")]
-    Jump {
-        /// Distance from the last keyframe, frame units.
-        moved: f64,
-        /// The most that is accepted: [`JUMP_SUBMAPS_MAX`] × `distance_m`.
-        allowed: f64,
-    },
-}
-
 /// Cuts keyframes into submaps; see the [module](self).
 #[derive(Clone, Debug)]
 pub struct SubmapBuilder {
@@ -147,6 +69,10 @@ pub struct SubmapBuilder {
     open: Option<Open>,
     /// A keyframe was refused since the last accepted one.
     gap: bool,
+    /// Whether keyframes go on from one another.
+    continuity: Continuity,
+    /// What the front end calls its run, if it said.
+    session: Option<u64>,
     /// Where the body is: as the SLAM has it, or a laser's scans.
     t_frame_body: Se3,
     sharpener: Sharpener,
@@ -162,6 +88,8 @@ struct Open {
     t_frame_first: Se3,
     /// Motion to each keyframe from the one before; none to the first.
     motions: Vec<PoseWithCovariance>,
+    /// All of them compounded.
+    gathered: Option<PoseWithCovariance>,
     /// `t_first_body` of each keyframe.
     keyframes: Vec<Se3>,
     /// About the first body pose, until it is known which is the middle one.
@@ -182,6 +110,8 @@ impl SubmapBuilder {
             resumed_at: None,
             open: None,
             gap: false,
+            continuity: Continuity::default(),
+            session: None,
             t_frame_body: Se3::identity(),
             sharpener: Sharpener::default(),
             misfits: Misfits::default(),
@@ -206,9 +136,15 @@ impl SubmapBuilder {
         if let Err(error) = self.check(&keyframe) {
             // A repeated or late keyframe is no loss; any other leaves a hole in the odometry.
             self.gap |= !matches!(error, KeyframeError::StampNotRising { .. });
+            if matches!(error, KeyframeError::Jump { .. }) {
+                self.continuity.refuse(&keyframe, &self.config);
+            }
             return Err(error);
         }
+        self.continuity.take(&keyframe, &self.config);
+        self.session = keyframe.session.or(self.session);
         let step = self.step(&keyframe);
+        let ended = if step.as_ref().is_some_and(|step| self.would_blur(step)) { self.flush() } else { None };
         self.t_frame_body = match (&step, self.config.sensor) {
             (Some(step), Sensor::Laser2d) => self.t_frame_body * step.pose,
             (None, Sensor::Laser2d) | (_, Sensor::Landmarks2d) => flat(&keyframe.pose.pose),
@@ -218,7 +154,8 @@ impl SubmapBuilder {
         self.extend(&keyframe);
         self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), place: None, ..keyframe });
         self.gap = false;
-        Ok(if self.is_complete() { self.flush() } else { None })
+        // What was just begun is complete only where each keyframe is a submap, and there none was open.
+        Ok(if self.is_complete() { self.flush().or(ended) } else { ended })
     }
 
     /// Closes the open submap now, if it holds a keyframe.
@@ -242,6 +179,28 @@ impl SubmapBuilder {
     /// so much that the intrinsics, the unit, the extrinsics or the odometry must be wrong. Only of depth cameras.
     pub fn take_misfit(&mut self) -> Option<f64> {
         self.misfit.take()
+    }
+
+    /// Passes over a keyframe that there is no room for. Where it is counts, so that what goes on from it later is known to
+    /// go on; the odometry has a hole.
+    pub fn pass(&mut self, keyframe: &Keyframe) {
+        if self.check(keyframe).is_ok() {
+            self.continuity.take(keyframe, &self.config);
+            self.gap = true;
+        }
+    }
+
+    /// By what it shows, if it does, that this keyframe belongs to a new frame: the front end says so by another
+    /// `session`, or it is the last that was wanted to be sure (see [`continuity`](super::continuity)). Then it is the
+    /// first to [`push`](Self::push) to a new builder.
+    pub fn another_frame(&self, keyframe: &Keyframe) -> Option<FrameSign> {
+        let is_late = keyframe.stamp <= self.last.as_ref()?.stamp;
+        match (self.session, keyframe.session) {
+            // A session that is over may have keyframes on their way.
+            (Some(before), Some(now)) if now != before => (now > before || !is_late).then_some(FrameSign::Session),
+            _ if is_late || !self.continuity.is_restart(keyframe, &self.config) => None,
+            _ => matches!(self.check(keyframe), Err(KeyframeError::Jump { .. })).then_some(FrameSign::Jump),
+        }
     }
 
     fn check(&self, keyframe: &Keyframe) -> Result<(), KeyframeError> {
@@ -279,13 +238,7 @@ impl SubmapBuilder {
         if let Some(place) = keyframe.place.as_ref().filter(other) {
             return Err(KeyframeError::OtherPlace { numbers: place.vector().len(), model: place.model().into() });
         }
-        let allowed = JUMP_SUBMAPS_MAX * self.config.distance_m;
-        let moved =
-            self.last.as_ref().map_or(0.0, |last| (keyframe.pose.pose.translation - last.pose.pose.translation).norm());
-        if moved > allowed {
-            return Err(KeyframeError::Jump { moved, allowed });
-        }
-        Ok(())
+        self.continuity.check(keyframe, &self.config)
     }
 
     /// The motion since the last keyframe, if there was one.
@@ -319,6 +272,7 @@ impl SubmapBuilder {
         self.since_finished = self.since_finished.map(|since| since.compose(&step));
         if let Some(open) = &mut self.open {
             open.motions.push(step);
+            open.gathered = Some(open.gathered_with(&step));
         }
     }
 
@@ -333,6 +287,7 @@ impl SubmapBuilder {
                 odometry: self.since_finished.unwrap_or(first),
                 t_frame_first: t_frame_body,
                 motions: Vec::new(),
+                gathered: None,
                 keyframes: Vec::new(),
                 cloud: Thinner::new(self.config.voxel_m, self.config.points_max),
                 landmarks: Gatherer::new(self.config.voxel_m, self.config.points_max),
@@ -370,11 +325,35 @@ impl SubmapBuilder {
             gone.translation.norm() >= self.config.distance_m
                 || gone.rotation.angle() >= self.config.rotation_deg.to_radians()
                 || open.keyframes.len() >= self.config.keyframes_max as usize
+                || (open.stamps[1].secs_since(open.stamps[0]) >= self.config.secs_max && !self.stands(open))
         })
+    }
+
+    /// Whether the body stood all the time: it sees nothing new, and needs no submap to say so.
+    fn stands(&self, open: &Open) -> bool {
+        let turn = STANDS_TURN * self.config.rotation_deg.to_radians();
+        let is_there = |t: &Se3| t.translation.norm() < self.config.voxel_m && t.rotation.angle() < turn;
+        open.keyframes.iter().all(is_there)
+    }
+
+    /// Whether with this motion the open submap's last pose would be too uncertain in its first.
+    fn would_blur(&self, step: &PoseWithCovariance) -> bool {
+        let Some(open) = &self.open else { return false };
+        let sigmas = open.gathered_with(step).covariance.sigmas();
+        // Out of the plane nothing is claimed to be known.
+        let axes: [&[usize]; 2] =
+            if self.config.sensor.is_planar() { [&[0, 1], &[5]] } else { [&[0, 1, 2], &[3, 4, 5]] };
+        let [way, turn] = axes.map(|axes| axes.iter().map(|&k| sigmas[k]).fold(0.0, f64::max));
+        way > self.config.sigma_max_m || turn > self.config.sigma_max_deg.to_radians()
     }
 }
 
 impl Open {
+    /// The motion from the first keyframe to the one that this step leads to.
+    fn gathered_with(&self, step: &PoseWithCovariance) -> PoseWithCovariance {
+        self.gathered.map_or(*step, |gathered| gathered.compose(step))
+    }
+
     /// Position of the keyframe that anchors the submap.
     fn middle(&self) -> usize {
         self.keyframes.len().saturating_sub(1) / 2
@@ -438,6 +417,9 @@ fn unmoved() -> Covariance<6> {
 fn moved(t: &Se3, p: [f64; 3]) -> [f64; 3] {
     (*t * Vector3::from(p)).into()
 }
+
+/// A body that turns by less than this share of `rotation_deg`, and moves by less than a voxel, stands.
+const STANDS_TURN: f64 = 0.1;
 
 /// Stands for a standard deviation of zero: a body that did not move.
 const ZERO_SIGMA: f64 = 1e-8;

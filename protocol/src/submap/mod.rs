@@ -13,6 +13,7 @@
 mod block;
 pub mod builder;
 mod cloud;
+pub mod continuity;
 mod court;
 pub mod describe;
 mod descriptor;
@@ -27,6 +28,7 @@ mod odometry;
 pub mod place;
 pub mod planar;
 pub mod refine;
+mod refusal;
 pub mod register;
 mod rings;
 mod sampling;
@@ -40,13 +42,14 @@ mod views;
 mod visibility;
 
 pub use block::{BlockError, Surfel};
-pub use builder::{KeyframeError, Submap, SubmapBuilder};
+pub use builder::{Submap, SubmapBuilder};
 pub use describe::{Described, describe};
 pub use features::{Features, Keypoints};
 pub use landmarks::Mark;
 pub use matching::{Matches, fit, match_keypoints};
 pub use place::{PlaceDescriptor, PlaceError};
 pub use refine::{RefineConfig, RefineError, Refined, refine};
+pub use refusal::KeyframeError;
 pub use register::{RegisterConfig, RegisterError, Registered, register};
 pub use summary::{Looks, SUMMARY_LEN_MAX, Similarity, Summary, SummaryError};
 pub use visibility::contradiction;
@@ -59,6 +62,8 @@ use crate::time::Stamp;
 pub struct Keyframe {
     /// When, on the robot's clock; must rise.
     pub stamp: Stamp,
+    /// Which run of the front end it is of, if it says: another one is another frame, hence a new epoch.
+    pub session: Option<u64>,
     /// `t_frame_body`: pose of the body in the SLAM's local frame, and a covariance whose meaning `covariance_of` tells.
     pub pose: PoseWithCovariance,
     /// What the covariance describes.

@@ -39,6 +39,7 @@ pub fn keyframe(stamp: i64, pose: Se3, points: &[Vector3<f64>]) -> Keyframe {
         stamp: Stamp(stamp),
         pose: PoseWithCovariance { pose, covariance: Covariance::from_sigmas([0.01; 6]).unwrap() },
         covariance_of: CovarianceOf::Motion,
+        session: None,
         points: points.iter().map(|p| [p.x as f32, p.y as f32, p.z as f32]).collect(),
         marks: Vec::new(),
         place: None,

@@ -121,6 +121,7 @@ pub fn drive(world: &World, k: usize, count: usize) -> (Vec<Keyframe>, Vec<Se3>)
             stamp: Stamp(n as i64 * 1_000_000_000),
             pose: PoseWithCovariance { pose: odometry, covariance },
             covariance_of: CovarianceOf::Motion,
+            session: None,
             points: world.scan(&pose, 7 * n as u64 + 1000 * k as u64),
             marks: Vec::new(),
             place: None,

@@ -118,6 +118,7 @@ pub fn described() -> &'static (Vec<u8>, Vec<u8>) {
                 stamp: Stamp(1),
                 pose,
                 covariance_of: CovarianceOf::Motion,
+                session: None,
                 points,
                 marks: Vec::new(),
                 place: None,

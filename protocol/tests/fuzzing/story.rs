@@ -294,6 +294,7 @@ impl<'m, M: Meter> Story<'m, M> {
         let covariance_of = if look % 32 == 1 { CovarianceOf::Pose } else { CovarianceOf::Motion };
         let keyframe = Keyframe {
             stamp: Stamp(self.stamp),
+            session: None,
             pose: forge::pose(r),
             covariance_of,
             points,

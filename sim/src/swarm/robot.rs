@@ -283,6 +283,7 @@ impl Slam {
             stamp: Stamp(stamp),
             pose: PoseWithCovariance { pose, covariance: motion.covariance },
             covariance_of: CovarianceOf::Motion,
+            session: None,
             points,
             marks,
             place: None,

@@ -126,8 +126,15 @@ mod tests {
         let pose = PoseWithCovariance { pose: Se3::identity(), covariance };
         let at = |k: usize| [2.0, 0.2 * (k % 20) as f32, 0.2 * (k / 20) as f32 + 0.01 * x as f32];
         let points = (0..points).map(at).collect();
-        let keyframe =
-            Keyframe { stamp: Stamp(1), pose, covariance_of: CovarianceOf::Motion, points, marks: vec![], place: None };
+        let keyframe = Keyframe {
+            stamp: Stamp(1),
+            session: None,
+            pose,
+            covariance_of: CovarianceOf::Motion,
+            points,
+            marks: vec![],
+            place: None,
+        };
         builder.push(keyframe).unwrap();
         let job = Job::Describe(Box::new(DescribeJob { submap: builder.flush().unwrap(), config }));
         let there = Se3::new(Se3::identity().rotation, [x, 0.0, 0.0].into());

@@ -1,11 +1,12 @@
 //! Submaps of robots that drive among landmarks: what is kept of their sightings, and what a keyframe may hold.
 
-use super::super::builder::{KeyframeError, Submap, SubmapBuilder};
+use super::super::builder::{Submap, SubmapBuilder};
 use super::super::{CovarianceOf, Described, Keyframe, describe};
 use super::tests::{Dice, Thing, flat_frame, nees, normal, planar, vector, world};
 use super::{Mark, SIGMA_RANGE, register};
 use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, So3};
+use crate::submap::KeyframeError;
 use crate::time::Stamp;
 use nalgebra::{Matrix3, Vector3, Vector6};
 use rand::{RngExt, SeedableRng};
@@ -17,7 +18,15 @@ fn config(sensor: Sensor) -> SubmapConfig {
 fn keyframe(stamp: i64, pose: Se3, points: Vec<[f32; 3]>, marks: Vec<Mark>) -> Keyframe {
     let covariance = Covariance::from_sigmas(MOTION).unwrap();
     let pose = PoseWithCovariance { pose, covariance };
-    Keyframe { stamp: Stamp(stamp), pose, covariance_of: CovarianceOf::Motion, points, marks, place: None }
+    Keyframe {
+        stamp: Stamp(stamp),
+        pose,
+        covariance_of: CovarianceOf::Motion,
+        session: None,
+        points,
+        marks,
+        place: None,
+    }
 }
 
 /// Standard deviations of a keyframe's motion in these tests.

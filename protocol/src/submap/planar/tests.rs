@@ -61,7 +61,15 @@ fn scan(pose: &Flat, walls: &[Wall]) -> Vec<[f32; 3]> {
 fn keyframe(stamp: i64, pose: Se3, sigma: f64, points: Vec<[f32; 3]>) -> Keyframe {
     let covariance = Covariance::from_sigmas([sigma, sigma, 1e-3, 1e-4, 1e-4, 0.5 * sigma]).unwrap();
     let pose = PoseWithCovariance { pose, covariance };
-    Keyframe { stamp: Stamp(stamp), pose, covariance_of: CovarianceOf::Motion, points, marks: Vec::new(), place: None }
+    Keyframe {
+        stamp: Stamp(stamp),
+        pose,
+        covariance_of: CovarianceOf::Motion,
+        session: None,
+        points,
+        marks: Vec::new(),
+        place: None,
+    }
 }
 
 /// A drive along places of the plan, seen in a frame `t_frame_plan`; and `t_plan_anchor`.

@@ -83,6 +83,7 @@ fn of_robot(outcome: &Outcome<Agent>, robot: usize, config: &SubmapConfig) -> an
             stamp: Stamp(i64::try_from(step.nanos)?),
             pose: PoseWithCovariance { pose: step.t_frame_body, covariance: step.motion.covariance },
             covariance_of: CovarianceOf::Motion,
+            session: None,
             points,
             marks,
             place: None,

@@ -215,7 +215,15 @@ fn build(config: &SubmapConfig, keyframes: &[(Se3, Vec<[f32; 3]>)]) -> anyhow::R
         let covariance = Covariance::from_sigmas([0.01; 6])?;
         let pose = PoseWithCovariance { pose: *pose, covariance };
         let (stamp, covariance_of) = (Stamp(k), CovarianceOf::Motion);
-        builder.push(Keyframe { stamp, pose, covariance_of, points: points.clone(), marks: vec![], place: None })?;
+        builder.push(Keyframe {
+            stamp,
+            session: None,
+            pose,
+            covariance_of,
+            points: points.clone(),
+            marks: vec![],
+            place: None,
+        })?;
     }
     builder.flush().context("no keyframes")
 }

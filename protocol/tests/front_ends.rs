@@ -1,0 +1,141 @@
+//! Front ends that restart, relocalise or err: a new epoch or a refusal, and no lie in the odometry.
+#![allow(missing_docs, clippy::unwrap_used, reason = "a test fails by panicking")]
+
+mod common;
+
+use common::{Wires, agent};
+use merganser_protocol::agent::Restored;
+use merganser_protocol::agent::io::{Command, EpochReason, Event, Input, Record};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use merganser_protocol::submap::continuity::RESTART_KEYFRAMES;
+use merganser_protocol::submap::{CovarianceOf, Keyframe};
+use merganser_protocol::time::Stamp;
+use merganser_protocol::wire::entry::Entry;
+use merganser_protocol::wire::fact::{Fact, SubmapFact};
+use nalgebra::Vector3;
+use std::time::Duration;
+
+const FIRST_EPOCH: u32 = 2;
+/// Way between two keyframes, m, and the standard deviation that is stated of it.
+const STEP: f64 = 0.78;
+const SIGMA: f64 = 0.01;
+
+fn keyframe(secs: u32, x: f64) -> Keyframe {
+    let covariance = Covariance::from_sigmas([SIGMA; 6]).unwrap();
+    let pose = PoseWithCovariance { pose: Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0)), covariance };
+    let points = (0..400).map(|k| [(k % 20) as f32 * 0.3, (k / 20) as f32 * 0.3 - 3.0, 1.0 + (k % 7) as f32 * 0.1]);
+    let (stamp, covariance_of) = (Stamp(i64::from(secs) * 1_000_000_000), CovarianceOf::Motion);
+    let points = points.collect();
+    Keyframe { stamp, session: None, pose, covariance_of, points, marks: vec![], place: None }
+}
+
+/// A drive from the frame's origin: keyframe by keyframe, from that second on.
+fn drive(from: u32, count: u32) -> Vec<Keyframe> {
+    (0..count).map(|k| keyframe(from + k, STEP * f64::from(k))).collect()
+}
+
+fn told(keyframes: Vec<Keyframe>) -> Wires {
+    let mut wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: FIRST_EPOCH })]);
+    for keyframe in keyframes {
+        wires.input(0, Input::Keyframe(keyframe));
+        wires.run(Duration::from_secs(1));
+    }
+    wires.input(0, Input::Command(Command::Flush));
+    wires
+}
+
+/// Why epochs began.
+fn begun(wires: &Wires) -> Vec<EpochReason> {
+    let reason = |(_, event): &(usize, Event)| match event {
+        Event::EpochBegan { reason, .. } => Some(*reason),
+        _ => None,
+    };
+    wires.events.iter().filter_map(reason).collect()
+}
+
+fn refusals(wires: &Wires) -> u64 {
+    wires.agents[0].snapshot(wires.now).stats.rejected.get("keyframe").copied().unwrap_or(0)
+}
+
+/// The epochs and submaps that were stated.
+fn stated(wires: &Wires) -> Vec<(u32, SubmapFact)> {
+    let submap = |record: &Record| match record {
+        Record::Entry { id, bytes } => match Entry::decode(bytes).unwrap().fact() {
+            Ok(Fact::Submap(fact)) => Some((id.frame.epoch, fact)),
+            _ => None,
+        },
+        _ => None,
+    };
+    wires.disks[0].iter().filter_map(submap).collect()
+}
+
+/// No motion was stated but those that were driven, with no more doubt than they had.
+fn is_all_driven(wires: &Wires, epochs: &[u32]) {
+    let stated = stated(wires);
+    assert!(epochs.iter().all(|epoch| stated.iter().any(|(of, _)| of == epoch)), "{stated:?}");
+    for (epoch, fact) in stated.iter().filter(|(_, fact)| fact.index > 0) {
+        let (way, sigma) = (fact.odometry.pose.translation.x, fact.odometry.covariance.sigmas()[0]);
+        // Submaps of 3 m, of at least two keyframes.
+        assert!((STEP..6.0).contains(&way) && sigma < 4.0 * SIGMA, "{epoch}#{}: {way:.2} ± {sigma:.3} m", fact.index);
+    }
+}
+
+#[test]
+fn a_slam_that_is_reset_to_its_origin_begins_an_epoch_and_no_lie_is_absorbed() {
+    // After 15.6 m, and after 31.2 m.
+    for driven in [21, 41] {
+        let wires = told([drive(0, driven), drive(driven, 60)].concat());
+        let status = wires.agents[0].status();
+        assert_eq!((status.epoch, begun(&wires)), (FIRST_EPOCH + 1, vec![EpochReason::Jumped]));
+        let lost = u64::from(RESTART_KEYFRAMES) - 1;
+        assert_eq!((refusals(&wires), status.keyframes), (lost, u64::from(driven) + 60 - lost));
+        is_all_driven(&wires, &[FIRST_EPOCH, FIRST_EPOCH + 1]);
+    }
+}
+
+#[test]
+fn one_wrong_pose_is_refused_by_a_clear_error() {
+    let mut keyframes = drive(0, 40);
+    keyframes[25].pose.pose.translation.y = 15.0;
+    let wires = told(keyframes);
+    assert_eq!((wires.agents[0].status().epoch, begun(&wires), refusals(&wires)), (FIRST_EPOCH, vec![], 1));
+    let said = wires.events.iter().find_map(|(_, event)| match event {
+        Event::Rejected { reason, .. } => Some(reason.clone()),
+        _ => None,
+    });
+    let said = said.unwrap();
+    for part in ["moved by 15.0", "in the 1.00 s", "at most 3.2", "odometry frame", "session", "submap.distance_m"] {
+        assert!(said.contains(part), "{part} is not in: {said}");
+    }
+}
+
+#[test]
+fn another_session_begins_an_epoch_at_once() {
+    let of = |session: u64, keyframes: Vec<Keyframe>| -> Vec<Keyframe> {
+        keyframes.into_iter().map(|keyframe| Keyframe { session: Some(session), ..keyframe }).collect()
+    };
+    // Where nobody could see it by the poses.
+    let wires = told([of(1, drive(0, 4)), of(2, drive(4, 20))].concat());
+    assert_eq!((wires.agents[0].status().epoch, begun(&wires)), (FIRST_EPOCH + 1, vec![EpochReason::Session]));
+    assert_eq!((refusals(&wires), wires.agents[0].status().keyframes), (0, 24));
+    is_all_driven(&wires, &[FIRST_EPOCH, FIRST_EPOCH + 1]);
+    // Who tells it both ways begins one.
+    let mut wires = told(of(1, drive(0, 4)));
+    wires.input(0, Input::Command(Command::NewEpoch));
+    of(2, drive(4, 4)).into_iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe)));
+    assert_eq!(begun(&wires), vec![EpochReason::Told]);
+}
+
+#[test]
+fn beyond_its_last_epoch_a_robot_that_restarts_is_only_refused() {
+    let mut config = common::config();
+    config.gossip.epochs_per_robot_max = 1;
+    let mut wires = Wires::new(vec![common::agent_of(0, &config)]);
+    let keyframes = [drive(0, 21), drive(21, 12)].concat();
+    for keyframe in keyframes {
+        wires.input(0, Input::Keyframe(keyframe));
+        wires.run(Duration::from_secs(1));
+    }
+    let status = wires.agents[0].status();
+    assert_eq!((begun(&wires).len(), status.receive_only, status.keyframes), (1, true, 21));
+}
