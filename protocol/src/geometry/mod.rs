@@ -13,6 +13,7 @@ pub mod relative;
 pub mod se3;
 pub mod sim3;
 pub mod so3;
+pub mod split_ci;
 #[cfg(test)]
 pub(crate) mod test_support;
 
