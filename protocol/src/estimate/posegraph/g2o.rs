@@ -1,10 +1,11 @@
 //! g2o text files (Kümmerle et al. 2011): decides which lines make a sound pose graph.
 //!
-//! Read: `VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`, `VERTEX_SE2`, `EDGE_SE2`, comments; `FIX` and `PARAMS_*` are skipped. The
+//! Read: `VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`, `VERTEX_SE2`, `EDGE_SE2`, `FIX`, comments; `PARAMS_*` is skipped. The
 //! information of rotations is taken on the rotation vector, as GTSAM and SE-Sync do. Planar measurements become
 //! spatial ones that hold the plane: their information out of the plane is as large as the largest within it, and its
 //! value does not matter to the estimate, because nothing in the plane pulls out of it.
 
+use super::lines::{Files, without_mark};
 use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_weights, printed_matrix};
 use crate::geometry::so3::So3;
 use crate::geometry::{Se3, se3};
@@ -17,6 +18,8 @@ use thiserror::Error;
 pub const LINE_MAX: usize = 4096;
 /// How far a quaternion's norm may be from 1 before it is no rounding.
 const QUATERNION_NORM_SLACK: f64 = 1e-2;
+/// Longest coordinate, m: beyond it a double does not tell a tenth of a millimetre, and squares soon overflow.
+pub const LENGTH_MAX: f64 = 1e12;
 
 /// A line that cannot be part of a pose graph.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -45,6 +48,9 @@ pub enum Fault {
     /// A field that is no number.
     #[error("{0:?} is no finite number")]
     Number(String),
+    /// A coordinate that is out of range.
+    #[error("{0:e} m is more than {LENGTH_MAX:e} m; check its unit")]
+    Far(f64),
     /// A pose's name that is no whole number.
     #[error("{0:?} is no pose id; ids are whole numbers from 0")]
     Id(String),
@@ -65,6 +71,12 @@ pub enum Fault {
     /// Planar and spatial lines in one file.
     #[error("mixes planar and spatial lines; keep to one of SE2 and SE3:QUAT")]
     Mixed,
+    /// Lines that do not end as text files' do.
+    #[error("lines end in CR alone; make them end in LF, for example with `tr '\\r' '\\n'`")]
+    CarriageReturn,
+    /// Bytes that are no text.
+    #[error("this is no UTF-8 text; save the file as UTF-8")]
+    Text,
     /// A line that is too long.
     #[error("longer than {LINE_MAX} bytes")]
     Long,
@@ -76,15 +88,25 @@ pub enum Fault {
     Measurements,
 }
 
+/// Measurements that a file repeats to the bit. Each counts, as if it had been made so often.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Repeated {
+    /// How many repeat another.
+    pub count: usize,
+    /// The first such [`Measurement::line`].
+    pub line: usize,
+}
+
 /// Reads a file line by line.
 #[derive(Clone, Debug, Default)]
 pub struct Parser {
     graph: PoseGraph,
-    line: usize,
+    files: Files,
     /// Measurements of the files before this one.
     earlier: usize,
-    /// Measurements by their ends.
+    /// The first of the measurements that are equal, by their ends.
     between: BTreeMap<(u64, u64), Vec<usize>>,
+    repeated: Option<Repeated>,
     planar: Option<bool>,
 }
 
@@ -92,7 +114,7 @@ impl Parser {
     /// Begins the next file of the same graph: lines count from 1 again. A measurement between two robots stands in the
     /// files of both; what an earlier file holds to the bit is not taken again.
     pub fn begin(&mut self) {
-        self.line = 0;
+        self.files.begin();
         self.earlier = self.graph.measurements.len();
     }
 
@@ -101,8 +123,18 @@ impl Parser {
     /// # Errors
     /// [`G2oError`] with its number; nothing of the line is taken then.
     pub fn line(&mut self, text: &str) -> Result<(), G2oError> {
-        self.line += 1;
-        self.take(text).map_err(|what| G2oError { line: self.line, what })
+        let line = self.files.advance();
+        self.take(without_mark(text, line)).map_err(|what| G2oError { line, what })
+    }
+
+    /// Where the lines are that measurements name.
+    pub fn files(&self) -> &Files {
+        &self.files
+    }
+
+    /// Whether a file holds a measurement more than once.
+    pub fn repeated(&self) -> Option<Repeated> {
+        self.repeated
     }
 
     /// The graph so far.
@@ -112,6 +144,9 @@ impl Parser {
     }
 
     fn take(&mut self, text: &str) -> Result<(), Fault> {
+        if text.trim_end().contains('\r') {
+            return Err(Fault::CarriageReturn);
+        }
         if text.len() > LINE_MAX {
             return Err(Fault::Long);
         }
@@ -119,14 +154,19 @@ impl Parser {
         let Some(tag) = words.next() else { return Ok(()) };
         let fields: Vec<&str> = words.collect();
         match tag {
-            _ if tag.starts_with('#') || tag.starts_with("PARAMS_") || tag == "FIX" => Ok(()),
+            _ if tag.starts_with('#') || tag.starts_with("PARAMS_") => Ok(()),
+            "FIX" => {
+                let ids = fields.iter().map(|text| text.parse().map_err(|_| Fault::Id(cut(text))));
+                self.graph.fixed.extend(ids.collect::<Result<Vec<u64>, Fault>>()?);
+                Ok(())
+            }
             "VERTEX_SE3:QUAT" => {
                 let ([id], numbers) = parsed::<1, 7>(&fields)?;
                 self.pose(id, pose(&numbers)?, false)
             }
             "VERTEX_SE2" => {
                 let ([id], numbers) = parsed::<1, 3>(&fields)?;
-                self.pose(id, planar_pose(&numbers), true)
+                self.pose(id, planar_pose(&numbers)?, true)
             }
             "EDGE_SE3:QUAT" => {
                 let (ends, numbers) = parsed::<2, 28>(&fields)?;
@@ -138,10 +178,11 @@ impl Parser {
             "EDGE_SE2" => {
                 let (ends, numbers) = parsed::<2, 9>(&fields)?;
                 let (information, weights) = from_plane(&symmetric::<3>(&numbers[3..])).ok_or(Fault::Information)?;
-                let t_i_j = planar_pose(&numbers);
+                let t_i_j = planar_pose(&numbers)?;
                 self.measurement(ends, (t_i_j, t_i_j.rotation.matrix()), information, weights, true)
             }
-            _ => Err(Fault::Tag(tag.chars().take(40).collect())),
+            _ if tag.contains(['\0', char::REPLACEMENT_CHARACTER]) => Err(Fault::Text),
+            _ => Err(Fault::Tag(cut(tag))),
         }
     }
 
@@ -173,16 +214,14 @@ impl Parser {
         self.room_for(&[i, j])?;
         self.graph.poses.entry(i).or_default();
         self.graph.poses.entry(j).or_default();
-        let known = self.between.entry((i, j)).or_default();
-        let told = |&&k: &&usize| {
-            let m = &self.graph.measurements[k];
-            k < self.earlier && (m.t_i_j, m.information) == (t_i_j, information)
-        };
-        if known.iter().find(told).is_none() {
-            known.push(self.graph.measurements.len());
-            let line = self.line;
-            self.graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
+        let (known, line) = (self.between.entry((i, j)).or_default(), self.files.last());
+        let of = |k: usize| (&self.graph.measurements[k].t_i_j, &self.graph.measurements[k].information);
+        match known.iter().copied().find(|&k| of(k) == (&t_i_j, &information)) {
+            Some(k) if k < self.earlier => return Ok(()),
+            Some(_) => self.repeated.get_or_insert(Repeated { count: 0, line }).count += 1,
+            None => known.push(self.graph.measurements.len()),
         }
+        self.graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
         Ok(())
     }
 
@@ -222,11 +261,18 @@ fn pose(numbers: &[f64]) -> Result<Se3, Fault> {
     if (norm - 1.0).abs() > QUATERNION_NORM_SLACK {
         return Err(Fault::Quaternion(norm));
     }
+    in_range(&numbers[..3])?;
     Se3::from_xyzw(xyzw.map(|x| x / norm), [numbers[0], numbers[1], numbers[2]]).ok_or(Fault::Quaternion(norm))
 }
 
-fn planar_pose(numbers: &[f64]) -> Se3 {
-    Se3::new(So3::exp(&Vector3::new(0.0, 0.0, numbers[2])), Vector3::new(numbers[0], numbers[1], 0.0))
+fn planar_pose(numbers: &[f64]) -> Result<Se3, Fault> {
+    in_range(&numbers[..2])?;
+    Ok(Se3::new(So3::exp(&Vector3::new(0.0, 0.0, numbers[2])), Vector3::new(numbers[0], numbers[1], 0.0)))
+}
+
+fn in_range(coordinates: &[f64]) -> Result<(), Fault> {
+    let far = coordinates.iter().find(|x| x.abs() > LENGTH_MAX);
+    far.map_or(Ok(()), |&x| Err(Fault::Far(x)))
 }
 
 /// A symmetric matrix from its upper triangle, row by row.
@@ -257,7 +303,8 @@ fn from_plane(planar: &Matrix3<f64>) -> Option<(Matrix6<f64>, (f64, f64))> {
     Some((out, (planar[(2, 2)], 2.0 / trace)))
 }
 
-/// A graph as a g2o file: poses with a value, then measurements. Planar graphs are written as such.
+/// A graph as a g2o file: poses with a value, those that are fixed, then measurements. Planar graphs are written as
+/// such.
 pub fn write(graph: &PoseGraph) -> String {
     let mut out = String::new();
     for (id, value) in &graph.poses {
@@ -268,6 +315,9 @@ pub fn write(graph: &PoseGraph) -> String {
                 writeln!(out, "VERTEX_SE3:QUAT {id} {}", pose_numbers(value))
             };
         }
+    }
+    for id in graph.fixed.iter().filter(|id| graph.poses.contains_key(id)) {
+        let _ = writeln!(out, "FIX {id}");
     }
     for m in &graph.measurements {
         let places: &[usize] = if graph.planar { &[0, 1, 5] } else { &[0, 1, 2, 3, 4, 5] };

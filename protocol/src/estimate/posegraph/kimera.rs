@@ -3,6 +3,7 @@
 //! Columns, by name: `robot_src, pose_src, robot_dst, pose_dst, qx, qy, qz, qw, tx, ty, tz, kappa, tau`, and optionally
 //! `is_known_inlier, weight`. A pose becomes the g2o id with the robot's letter in the top byte, as GTSAM's symbols are.
 
+use super::lines::{Files, without_mark};
 use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_information, printed_matrix};
 use crate::geometry::Se3;
 use std::collections::{BTreeMap, BTreeSet};
@@ -74,13 +75,14 @@ pub struct Importer {
     recorded: Vec<Recorded>,
     seen: BTreeSet<(u64, u64)>,
     columns: Vec<String>,
-    line: usize,
+    files: Files,
 }
 
 impl Importer {
     /// Begins the next table.
     pub fn begin(&mut self) {
-        (self.line, self.columns) = (0, Vec::new());
+        self.files.begin();
+        self.columns = Vec::new();
     }
 
     /// Takes the next line of the table.
@@ -88,8 +90,8 @@ impl Importer {
     /// # Errors
     /// [`KimeraError`] with its number; nothing of the line is taken then.
     pub fn line(&mut self, text: &str) -> Result<(), KimeraError> {
-        self.line += 1;
-        self.take(text).map_err(|what| KimeraError { line: self.line, what })
+        let line = self.files.advance();
+        self.take(without_mark(text, line)).map_err(|what| KimeraError { line, what })
     }
 
     /// The graph, and what was recorded of each measurement.
@@ -141,7 +143,7 @@ impl Importer {
             known: row.get("is_known_inlier").is_some_and(|&text| text == "1"),
             weight: if row.contains_key("weight") { number("weight")? } else { 1.0 },
         };
-        let (printed, information, line) = (printed_matrix(xyzw), isotropic_information(kappa, tau), self.line);
+        let (printed, information, line) = (printed_matrix(xyzw), isotropic_information(kappa, tau), self.files.last());
         self.add(Measurement { i, j, t_i_j, printed, information, kappa, tau, line }, recorded)
     }
 

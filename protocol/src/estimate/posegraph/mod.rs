@@ -3,8 +3,12 @@
 //! [`g2o`] and [`kimera`] read and write files' lines, [`solve`] solves the connected parts of a graph with the
 //! estimate's own solver. Files are read line by line by the caller; nothing here touches a disk.
 
+pub mod fault;
 pub mod g2o;
+mod gauge;
 pub mod kimera;
+pub mod lines;
+pub mod marginals;
 pub mod robust;
 pub mod solve;
 
@@ -15,7 +19,7 @@ use super::chordal::{ChordalEdge, ChordalGraph};
 use super::graph::Disjoint;
 use crate::geometry::{Covariance, Se3};
 use nalgebra::{Matrix3, Matrix6};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Poses a graph may have.
 pub const POSES_MAX: usize = 200_000;
@@ -40,7 +44,8 @@ pub struct Measurement {
     pub kappa: f64,
     /// SE-Sync's weight of the translation.
     pub tau: f64,
-    /// What the file calls it, so that it can be written again: a line number.
+    /// Its line, so that it can be found again: from 1, the lines of several files counted through
+    /// ([`lines::Files::place`]).
     pub line: usize,
 }
 
@@ -53,6 +58,9 @@ pub struct PoseGraph {
     pub measurements: Vec<Measurement>,
     /// All poses lie in the plane z = 0 and turn about z only.
     pub planar: bool,
+    /// Poses that the file fixes. Of each connected part one says where it lies ([`PoseGraph::place`]); the others are
+    /// estimated as all are.
+    pub fixed: BTreeSet<u64>,
 }
 
 impl PoseGraph {
@@ -66,7 +74,11 @@ impl PoseGraph {
         let mut parts: BTreeMap<usize, Self> = BTreeMap::new();
         let empty = || Self { planar: self.planar, ..Self::default() };
         for (&id, &value) in &self.poses {
-            parts.entry(sets.root(place[&id])).or_insert_with(empty).poses.insert(id, value);
+            let part = parts.entry(sets.root(place[&id])).or_insert_with(empty);
+            part.poses.insert(id, value);
+            if self.fixed.contains(&id) {
+                part.fixed.insert(id);
+            }
         }
         for m in &self.measurements {
             parts.entry(sets.root(place[&m.i])).or_insert_with(empty).measurements.push(m.clone());

@@ -1,13 +1,13 @@
 //! Solving a pose graph: decides the start, and says what is known about the minimum that is found.
 
+use super::fault::{self, MeasurementFault, PoseGraphError};
 use super::{PoseGraph, covariance_of};
 use crate::estimate::certificate::Certificate;
-use crate::estimate::graph::{Factor, Graph, GraphError, Label};
-use crate::estimate::solve::{Solution, SolveError, minimum, solve};
+use crate::estimate::graph::{Factor, Graph, Label};
+use crate::estimate::solve::{Solution, minimum, solve};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{FrameId, RobotId, SubmapId};
 use std::collections::{BTreeMap, BTreeSet};
-use thiserror::Error;
 
 /// Where a minimisation starts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -18,28 +18,6 @@ pub enum Start {
     Chordal,
     /// The values of the file.
     Given,
-}
-
-/// Why a graph could not be solved.
-#[derive(Clone, Debug, Error, PartialEq)]
-pub enum PoseGraphError {
-    /// The numbers do not allow it.
-    #[error(transparent)]
-    Solve(#[from] SolveError),
-    /// A measurement that cannot be used.
-    #[error(transparent)]
-    Graph(#[from] GraphError),
-    /// The start wants a value that the file does not give.
-    #[error("pose {0} has no value; add its vertex or start from the relaxation")]
-    NoValue(u64),
-    /// A measurement's information that is no inverse of a covariance.
-    #[error(
-        "line {0}: the information matrix is not positive definite; mend it, or solve with isotropic weights in its place"
-    )]
-    Information(usize),
-    /// Poses that no measurement ties together.
-    #[error("the graph has {0} parts; solve each by itself")]
-    Parts(usize),
 }
 
 /// The certified side of a solution.
@@ -86,10 +64,11 @@ impl PoseGraph {
     /// [`PoseGraphError`] if a value is wanted that is not there, or the graph is not connected.
     pub fn start(&self, start: Start, iterations_max: usize) -> Result<Vec<Se3>, PoseGraphError> {
         match start {
-            Start::Relaxed => Ok(self.chordal().relaxed()?),
+            Start::Relaxed => self.chordal().relaxed().map_err(|e| self.told(e)),
             Start::Chordal => {
                 let chordal = self.chordal();
-                Ok(chordal.minimise(&chordal.relaxed()?, iterations_max)?.values)
+                let minimum = chordal.relaxed().and_then(|start| chordal.minimise(&start, iterations_max));
+                Ok(minimum.map_err(|e| self.told(e))?.values)
             }
             Start::Given => {
                 let given = self.poses.iter().map(|(&id, value)| value.ok_or(PoseGraphError::NoValue(id)));
@@ -104,8 +83,9 @@ impl PoseGraph {
     /// [`PoseGraphError`] if the graph is not connected or cannot be solved.
     pub fn certified(&self, iterations_max: usize) -> Result<(Vec<Se3>, ChordalOutcome), PoseGraphError> {
         let chordal = self.chordal();
-        let minimum = chordal.minimise(&chordal.relaxed()?, iterations_max)?;
-        let certificate = chordal.certify(&minimum.values)?;
+        let minimum = chordal.relaxed().and_then(|start| chordal.minimise(&start, iterations_max));
+        let minimum = minimum.map_err(|e| self.told(e))?;
+        let certificate = chordal.certify(&minimum.values).map_err(|e| self.told(e))?;
         let (cost, iterations, converged) = (minimum.cost, minimum.iterations, minimum.converged);
         Ok((minimum.values, ChordalOutcome { cost, iterations, converged, certificate }))
     }
@@ -115,7 +95,8 @@ impl PoseGraph {
     /// # Errors
     /// [`PoseGraphError`] if the graph is not connected or cannot be solved.
     pub fn minimise(&self, start: &[Se3], iterations_max: usize) -> Result<Minimised, PoseGraphError> {
-        let found = minimum(&self.graph()?, start.iter().map(Sim3::from_se3).collect(), iterations_max)?;
+        let start = start.iter().map(Sim3::from_se3).collect();
+        let found = minimum(&self.graph()?, start, iterations_max).map_err(|e| self.told(e))?;
         let values = found.values.iter().map(Sim3::to_se3).collect();
         Ok(Minimised { values, chi2: found.chi2, iterations: found.iterations, converged: found.converged })
     }
@@ -125,7 +106,8 @@ impl PoseGraph {
     /// # Errors
     /// As [`PoseGraph::minimise`].
     pub fn solve(&self, start: &[Se3], iterations_max: usize) -> Result<Solved, PoseGraphError> {
-        let solution = solve(self.graph()?, start.iter().map(Sim3::from_se3).collect(), iterations_max)?;
+        let start = start.iter().map(Sim3::from_se3).collect();
+        let solution = solve(self.graph()?, start, iterations_max).map_err(|e| self.told(e))?;
         let values = solution.values().iter().map(Sim3::to_se3).collect();
         Ok(Solved { ids: self.poses.keys().copied().collect(), values, solution })
     }
@@ -134,7 +116,11 @@ impl PoseGraph {
     fn graph(&self) -> Result<Graph, PoseGraphError> {
         let place: BTreeMap<u64, SubmapId> = self.poses.keys().copied().zip((0..).map(node)).collect();
         let factor = |m: &super::Measurement| {
-            let covariance = covariance_of(&m.information).ok_or(PoseGraphError::Information(m.line))?;
+            if !m.t_i_j.translation.iter().all(|x| x.is_finite()) {
+                return Err(fault::overflow(m));
+            }
+            let what = MeasurementFault::Information;
+            let covariance = covariance_of(&m.information).ok_or(PoseGraphError::At { line: m.line, what })?;
             let t_i_j = Relative::Metric(PoseWithCovariance { pose: m.t_i_j, covariance });
             Ok(Factor { label: Label::Odometry, i: place[&m.i], j: place[&m.j], t_i_j, weight: 1.0 })
         };
@@ -152,7 +138,13 @@ impl Solved {
     /// The covariance of every pose relative to the first (local perturbation of `t_first_pose`), by selected
     /// inversion; in the order of [`Solved::ids`].
     pub fn marginals(&self) -> Vec<(u64, Covariance<6>)> {
-        let relations = self.solution.relatives_to(node(0), &BTreeSet::new());
+        self.marginals_from(0)
+    }
+
+    /// The same relative to another pose, by its place among [`Solved::ids`].
+    pub fn marginals_from(&self, origin: usize) -> Vec<(u64, Covariance<6>)> {
+        let Ok(origin) = u32::try_from(origin) else { return Vec::new() };
+        let relations = self.solution.relatives_to(node(origin), &BTreeSet::new());
         let rigid = relations.into_iter().filter_map(|(id, t)| Some((id.index as usize, t.metric()?.covariance)));
         rigid.filter_map(|(k, covariance)| Some((*self.ids.get(k)?, covariance))).collect()
     }

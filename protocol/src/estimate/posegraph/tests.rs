@@ -1,8 +1,10 @@
 //! Files, minima, certificates and covariances of pose graphs.
 
-use super::g2o::{Fault, G2oError, LINE_MAX, Parser, write, write_tum};
+use super::fault::{MeasurementFault, PoseGraphError};
+use super::g2o::{Fault, G2oError, LINE_MAX, Parser, Repeated, write, write_tum};
 use super::kimera::{Importer, KimeraError, KimeraFault};
-use super::solve::{PoseGraphError, Start};
+use super::lines::Place;
+use super::solve::Start;
 use super::*;
 use crate::geometry::so3::So3;
 use crate::geometry::{Se3, se3};
@@ -232,8 +234,14 @@ fn faults_name_their_line_and_what_to_do() {
     assert_eq!(fault(&good.replace("0 1 0 1", "0 0 0 1")), Fault::Information);
     let indefinite = parsed(&good.replace("0 0 0 0 0 1 0 0 0 0", "0 0 0 0 9 1 0 0 0 0")).unwrap();
     let start = indefinite.start(Start::Relaxed, 10).unwrap();
-    assert_eq!(indefinite.solve(&start, 10).unwrap_err(), PoseGraphError::Information(1));
+    let refused = PoseGraphError::At { line: 1, what: MeasurementFault::Information };
+    assert_eq!(indefinite.solve(&start, 10).unwrap_err(), refused);
     assert!(indefinite.isotropic().solve(&start, 10).is_ok());
+    assert_eq!(fault("VERTEX_SE2 0 1 -2e12 3"), Fault::Far(-2e12));
+    assert_eq!(fault("FIX 0 one"), Fault::Id("one".into()));
+    assert_eq!(fault("VERTEX_SE2 0 0 0 0\rVERTEX_SE2 1 0 0 0\r"), Fault::CarriageReturn);
+    assert_eq!(fault("\u{fffd}\u{fffd}V\0E\0"), Fault::Text);
+    assert!(parsed(&format!("\u{feff}{good}\r\n")).is_ok());
     assert_eq!(fault(&"x".repeat(LINE_MAX + 1)), Fault::Long);
     assert_eq!(fault(&format!("#{}", "x".repeat(LINE_MAX))), Fault::Long);
     let two = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 0 1 0 0";
@@ -256,7 +264,12 @@ fn what_two_robots_files_both_hold_counts_once() {
         parser.line(line).unwrap();
     }
     assert_eq!(parser.line("nonsense").unwrap_err().line, 3);
-    assert_eq!(parser.finish().measurements.len(), 4);
+    assert_eq!(parser.repeated(), Some(Repeated { count: 1, line: 2 }));
+    let places: Vec<Place> = [1, 2, 3, 5].map(|line| parser.files().place(line)).into();
+    let graph = parser.finish();
+    assert_eq!(graph.measurements.iter().map(|m| m.line).collect::<Vec<_>>(), [1, 2, 3, 5]);
+    let at = |file, line| Place { file, line };
+    assert_eq!(places, [at(0, 1), at(0, 2), at(0, 3), at(1, 2)]);
 }
 
 #[test]
@@ -284,7 +297,7 @@ fn parts_are_solved_by_themselves_and_said() {
     graph.poses.extend((10..14).chain([99]).map(|k| (k, None)));
     let start = vec![Se3::identity(); graph.poses.len()];
     assert_eq!(graph.solve(&start, 10).unwrap_err(), PoseGraphError::Parts(3));
-    assert!(matches!(graph.start(Start::Relaxed, 10), Err(PoseGraphError::Solve(_))));
+    assert_eq!(graph.start(Start::Relaxed, 10), Err(PoseGraphError::Parts(3)));
     assert_eq!(graph.start(Start::Given, 10), Err(PoseGraphError::NoValue(0)));
     let parts = graph.parts();
     let sizes: Vec<usize> = parts.iter().map(|part| part.poses.len()).collect();
@@ -323,4 +336,96 @@ fn kimera_tables_are_read_by_their_columns() {
 fn trajectories_are_written_as_tum() {
     let pose = Se3::new(So3::identity(), Vector3::new(1.0, 2.5, -3.0));
     assert_eq!(write_tum([(&7, &pose)]), "7 1 2.5 -3 0 0 0 1\n");
+}
+
+/// A ring of poses c0 to c4, and c5 and c6 that hang on it by much too little.
+fn ill() -> PoseGraph {
+    let name = |k: u64| (u64::from(b'c') << 56) | k;
+    let edge = |i: u64, j: u64, x: f64, w: &str| {
+        let upper = format!("{w} 0 0 0 0 0 {w} 0 0 0 0 {w} 0 0 0 {w} 0 0 {w} 0 {w}");
+        format!("EDGE_SE3:QUAT {} {} {x} 0 0 0 0 0 1 {upper}\n", name(i), name(j))
+    };
+    let ring = (0..5).map(|k| edge(k, (k + 1) % 5, if k < 4 { 1.0 } else { -3.9 }, "100"));
+    let text: String = ring.chain([edge(4, 5, 1.0, "1e-11"), edge(5, 6, 1.0, "1e12")]).collect();
+    parsed(&text).unwrap()
+}
+
+#[test]
+fn what_is_not_determined_or_overflows_is_told_by_pose_and_line() {
+    let graph = ill();
+    let start = vec![Se3::identity(); 7];
+    let error = graph.solve(&start, 10).unwrap_err();
+    let PoseGraphError::At { line: 6, what: MeasurementFault::Undetermined { pose, i, j, least, most } } = &error
+    else {
+        panic!("{error}")
+    };
+    assert_eq!([pose, i, j].map(|id| id & 0xff), [5, 4, 5]);
+    assert!((least / 1e-11 - 1.0).abs() < 1e-3 && *most == 1e12);
+    assert!(error.to_string().starts_with(&format!("line 6: pose {pose} (c5) is not determined: ")), "{error}");
+    let with = |change: &dyn Fn(&mut Measurement)| {
+        let mut graph = ill();
+        change(&mut graph.measurements[5]);
+        graph.solve(&start, 10).unwrap_err()
+    };
+    // Less than a covariance can hold.
+    let weaker = with(&|m| m.information *= 1e-9);
+    assert_eq!(weaker, PoseGraphError::At { line: 6, what: MeasurementFault::Information });
+    for length in [f64::INFINITY, 1e200] {
+        let far = with(&|m| (m.t_i_j.translation.x, m.information) = (length, Matrix6::identity()));
+        assert!(matches!(far, PoseGraphError::At { line: 6, what: MeasurementFault::Overflow { .. } }), "{far}");
+    }
+}
+
+#[test]
+fn a_part_lies_where_its_file_puts_its_origin() {
+    let there = Se3::exp(&uniform(&mut ChaCha8Rng::seed_from_u64(1), 1.0, 5.0));
+    let (truth, mut graph) = ring(9, 6, (0.1, 0.1));
+    let mut part: BTreeMap<u64, Se3> = (0..).zip(truth.iter().copied()).collect();
+    // Of no value: at the origin.
+    assert_eq!(graph.place(&mut part), Some(0));
+    assert_eq!(part[&0], Se3::identity());
+    graph.poses.insert(0, Some(there));
+    graph.poses.insert(4, Some(there));
+    let relative = part[&2].inverse() * part[&5];
+    for (fixed, origin) in [(vec![], 0), (vec![4], 4), (vec![4, 0, 70], 0)] {
+        graph.fixed = fixed.into_iter().collect();
+        assert_eq!(graph.place(&mut part), Some(origin));
+        assert_eq!(part[&origin], there);
+        assert!(relative.local(&(part[&2].inverse() * part[&5])).norm() < 1e-12);
+    }
+    assert_eq!(graph.place(&mut BTreeMap::new()), None);
+    let text = format!("{}VERTEX_SE3:QUAT 77 0 0 0 0 0 0 1\nFIX 77 3\n", write(&graph));
+    let read = parsed(&text).unwrap();
+    assert_eq!(read.fixed, BTreeSet::from([0, 3, 4, 77]));
+    let parts: Vec<BTreeSet<u64>> = read.parts().into_iter().map(|part| part.fixed).collect();
+    assert_eq!(parts, [BTreeSet::from([0, 3, 4]), BTreeSet::from([77])]);
+}
+
+#[test]
+fn covariances_relative_to_any_pose_are_those_of_relations() {
+    let (_, graph) = ring(12, 9, (0.2, 0.1));
+    let solved = graph.solve(&graph.start(Start::Relaxed, 100).unwrap(), 100).unwrap();
+    assert_eq!(solved.marginals_from(0), solved.marginals());
+    // Of the relation between two poses, seen from either end.
+    let of = |origin: usize, id: u64| solved.marginals_from(origin).into_iter().find(|(k, _)| *k == id).unwrap().1;
+    let t_3_7 = solved.values[3].inverse() * solved.values[7];
+    let forth = crate::geometry::PoseWithCovariance { pose: t_3_7, covariance: of(3, 7) };
+    let (back, want) = (of(7, 3), forth.inverse().covariance);
+    assert!((back.matrix() - want.matrix()).amax() < 1e-9 * want.matrix().amax());
+}
+
+#[test]
+fn robots_that_find_no_place_are_told_with_the_reason() {
+    let config = crate::config::EstimateConfig::default();
+    let (_, graph) = ring(13, 8, (0.1, 0.1));
+    assert_eq!(graph.unsolved(&graph.solve_robustly(&config)), []);
+    let graph = ill();
+    let solved = graph.solve_robustly(&config);
+    assert!(solved.components.is_empty() && !solved.map.converged);
+    let unsolved = graph.unsolved(&solved);
+    let [part] = &unsolved[..] else { panic!("{unsolved:?}") };
+    assert_eq!((part.first, part.poses), (graph.measurements[0].i, 7));
+    let Some(PoseGraphError::At { line: 6, what: MeasurementFault::Undetermined { .. } }) = part.why else {
+        panic!("{:?}", part.why)
+    };
 }

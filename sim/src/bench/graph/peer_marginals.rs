@@ -74,7 +74,7 @@ fn without_residuals(graph: &PoseGraph, values: &[Se3]) -> PoseGraph {
         }
         Measurement { t_i_j, ..m.clone() }
     };
-    PoseGraph { measurements: graph.measurements.iter().map(exact).collect(), poses, planar: false }
+    PoseGraph { measurements: graph.measurements.iter().map(exact).collect(), poses, ..PoseGraph::default() }
 }
 
 #[cfg(test)]

@@ -78,12 +78,16 @@ impl RobustSolved {
     /// Every pose in the coordinates of its component's smallest pose, with the covariance that the stated information
     /// gives.
     pub fn marginals(&self) -> BTreeMap<u64, PoseWithCovariance> {
+        self.marginals_from(|_| false)
+    }
+
+    /// The same in the coordinates of each component's smallest pose that is preferred, if there is one.
+    pub fn marginals_from(&self, is_preferred: impl Fn(u64) -> bool) -> BTreeMap<u64, PoseWithCovariance> {
         let ids: BTreeMap<SubmapId, u64> = self.anchors.iter().map(|(&id, &anchor)| (anchor, id)).collect();
         let mut out = BTreeMap::new();
         for solution in &self.solutions {
-            let smallest =
-                solution.graph().nodes().iter().filter_map(|anchor| Some((*ids.get(anchor)?, *anchor))).min();
-            let Some((_, first)) = smallest else { continue };
+            let named = solution.graph().nodes().iter().filter_map(|anchor| Some((*ids.get(anchor)?, *anchor)));
+            let Some((_, first)) = named.min_by_key(|(id, _)| (!is_preferred(*id), *id)) else { continue };
             for (anchor, t) in solution.relatives_to(first, &BTreeSet::new()) {
                 if let (Some(&id), Some(t)) = (ids.get(&anchor), t.metric()) {
                     out.insert(id, *t);

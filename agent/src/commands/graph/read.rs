@@ -1,0 +1,124 @@
+//! Graphs and tables from files, and errors told by file and line.
+
+use super::{counted, warn};
+use anyhow::{Context, Error, Result, anyhow, bail};
+use merganser_protocol::estimate::posegraph::PoseGraph;
+use merganser_protocol::estimate::posegraph::fault::{PoseGraphError, PoseName};
+use merganser_protocol::estimate::posegraph::g2o::{LINE_MAX, Parser};
+use merganser_protocol::estimate::posegraph::kimera::Importer;
+use merganser_protocol::estimate::posegraph::lines::Files;
+use merganser_protocol::estimate::posegraph::marginals::{Marginal, Reader};
+use std::collections::BTreeMap;
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+
+/// A graph, and where it was read.
+pub struct Source {
+    pub graph: PoseGraph,
+    names: Vec<PathBuf>,
+    lines: Files,
+}
+
+impl Source {
+    /// The graph of some g2o files; says what in them is odd but no fault.
+    pub fn read(files: &[PathBuf]) -> Result<Self> {
+        let mut parser = Parser::default();
+        for path in files {
+            parser.begin();
+            for line in lines(path)? {
+                parser
+                    .line(&line.with_context(|| path.display().to_string())?)
+                    .map_err(|e| at(path, e.line, e.what))?;
+            }
+        }
+        let (lines, repeated) = (parser.files().clone(), parser.repeated());
+        let graph = parser.finish();
+        if graph.poses.is_empty() {
+            bail!("{}: no pose in it", files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(", "));
+        }
+        let source = Self { graph, names: files.to_vec(), lines };
+        if let Some(repeated) = repeated {
+            let place = source.place(repeated.line);
+            let (count, s) = (counted(repeated.count, "measurement"), if repeated.count == 1 { "s" } else { "" });
+            warn(&format!("{place}: {count} repeat{s} another to the bit, first here; each counts as one of its own"));
+        }
+        for id in source.graph.fixed.iter().filter(|id| !source.graph.poses.contains_key(id)) {
+            warn(&format!("FIX names {}, which has no vertex and no measurement", PoseName(*id)));
+        }
+        Ok(source)
+    }
+
+    /// An error of a part of the graph: by file and line, or else by the part's smallest pose.
+    pub fn explained(&self, error: PoseGraphError, part: &PoseGraph) -> Error {
+        match (error, part.poses.keys().next()) {
+            (PoseGraphError::At { line, what }, _) => anyhow!("{}: {what}", self.place(line)),
+            (error, Some(&first)) => Error::new(error).context(format!("the part of {}", PoseName(first))),
+            (error, None) => Error::new(error),
+        }
+    }
+
+    /// `FILE:LINE` of a line counted through all files.
+    pub fn place(&self, line: usize) -> String {
+        let place = self.lines.place(line);
+        let name = self.names.get(place.file).map(|path| path.display().to_string()).unwrap_or_default();
+        format!("{name}:{}", place.line)
+    }
+}
+
+/// The graph of Kimera-Multi's tables.
+pub fn kimera(tables: &[PathBuf]) -> Result<PoseGraph> {
+    let mut importer = Importer::default();
+    for path in tables {
+        importer.begin();
+        for line in lines(path)? {
+            importer.line(&line.with_context(|| path.display().to_string())?).map_err(|e| at(path, e.line, e.what))?;
+        }
+    }
+    Ok(importer.finish().0)
+}
+
+/// The rows of a table of poses with covariances.
+pub fn marginals(path: &Path) -> Result<BTreeMap<u64, Marginal>> {
+    let mut reader = Reader::default();
+    for line in lines(path)? {
+        reader.line(&line.with_context(|| path.display().to_string())?).map_err(|e| at(path, e.line, e.what))?;
+    }
+    let rows = reader.finish();
+    if rows.is_empty() {
+        bail!("{}: no pose in it", path.display());
+    }
+    Ok(rows)
+}
+
+fn at(path: &Path, line: usize, what: impl Display) -> Error {
+    anyhow!("{}:{line}: {what}", path.display())
+}
+
+/// The lines of a text file; a line without end is cut, so that the parser refuses it.
+fn lines(path: &Path) -> Result<impl Iterator<Item = std::io::Result<String>>> {
+    let file = File::open(path).with_context(|| path.display().to_string())?;
+    let mut reader = BufReader::new(file);
+    Ok(std::iter::from_fn(move || {
+        let mut line = Vec::new();
+        loop {
+            let (used, done) = match reader.fill_buf() {
+                Ok([]) if line.is_empty() => return None,
+                Ok([]) => (0, true),
+                Ok(bytes) => {
+                    let end = bytes.iter().position(|&b| b == b'\n');
+                    let text = &bytes[..end.unwrap_or(bytes.len())];
+                    let room = (2 * LINE_MAX).saturating_sub(line.len());
+                    line.extend_from_slice(&text[..text.len().min(room)]);
+                    (text.len() + usize::from(end.is_some()), end.is_some())
+                }
+                Err(error) => return Some(Err(error)),
+            };
+            reader.consume(used);
+            if done {
+                return Some(Ok(String::from_utf8_lossy(&line).into_owned()));
+            }
+        }
+    }))
+}
