@@ -333,7 +333,8 @@ mod tests {
         };
         let mut other: BTreeMap<u64, Marginal> = all.values().map(moved).map(|row| (row.id, row)).collect();
         let mut one = all.clone();
-        (one.remove(&15), other.remove(&12));
+        one.remove(&15);
+        other.remove(&12);
         let out = fuse(&one, &other, 0.0).unwrap();
         assert_eq!((out.both, out.only), (4, [1, 1]));
         assert!(out.rows.iter().map(|row| row.id).eq(10..16));
