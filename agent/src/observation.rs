@@ -57,6 +57,15 @@
 //! "session": 1700000000
 //! ```
 //!
+//! `up` is the direction against gravity in the body frame, of length 1, if an inertial sensor tells it, and its standard
+//! deviation about each horizontal axis, rad (0.001 to 0.5; 0.02 if it is left out). If the frame's own z axis points up,
+//! say so in the configuration instead (`submap.gravity = "frame_z"`). A message may do without (in postcard: end with its
+//! place).
+//!
+//! ```text
+//! "up": {"direction": [0.012, -0.031, 0.9994], "sigma_rad": 0.01}
+//! ```
+//!
 //! A sighting of another robot states how it lies and is turned (`in/sighting`: `translation`, `rotation` and `covariance` of
 //! `t_body_other`, as in a keyframe); a range and a bearing, or a detection in an image of known depth, states where its
 //! body is alone (`in/position`), with the upper triangle of the 3×3 covariance, row by row:
@@ -72,11 +81,12 @@ pub use depth::{CameraPose, Data, DepthEncoding, DepthMessage};
 
 use crate::depth::DepthError;
 use merganser_protocol::agent::io::{PositionSighting, Sighting};
+use merganser_protocol::config::UP_SIGMA_RAD;
 use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::Name;
 use merganser_protocol::submap::landmarks::Descriptor;
 use merganser_protocol::submap::place::Metric;
-use merganser_protocol::submap::{CovarianceOf, Keyframe, Mark, PlaceDescriptor, PlaceError};
+use merganser_protocol::submap::{CovarianceOf, Keyframe, Mark, PlaceDescriptor, PlaceError, Up, UpError};
 use merganser_protocol::time::Stamp;
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use serde::de::{DeserializeOwned, IgnoredAny};
@@ -122,6 +132,24 @@ pub struct KeyframeMessage {
     /// Which run of the SLAM it is of, if it says: a number that is larger with each start.
     #[serde(default)]
     pub session: Option<u64>,
+    /// Which way is up, if an inertial sensor tells.
+    #[serde(default)]
+    pub up: Option<UpMessage>,
+}
+
+/// The direction against gravity.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UpMessage {
+    /// In the body frame, of length 1.
+    pub direction: [f64; 3],
+    /// Standard deviation about each horizontal axis, rad.
+    #[serde(default = "default_up_sigma_rad")]
+    pub sigma_rad: f64,
+}
+
+fn default_up_sigma_rad() -> f64 {
+    UP_SIGMA_RAD
 }
 
 /// A place descriptor of the user's own.
@@ -248,6 +276,9 @@ pub enum ObservationError {
     /// Nothing of an organised cloud was measured.
     #[error("none of the {0} points of the organised cloud is finite; leave the keyframe out")]
     Unmeasured(usize),
+    /// The vertical is none.
+    #[error("{0}")]
+    Up(#[from] UpError),
     /// Too many points.
     #[error("too many points: {0}; send at most {POINTS_MAX}, thinned if need be")]
     Points(usize),
@@ -277,14 +308,20 @@ fn states_points(json: &[u8]) -> bool {
 /// A postcard message that ends with its points or with what was added after them until some day: the rest was not known
 /// yet. Each addition is a zero byte where there is nothing of it.
 fn of_earlier_days(bytes: &[u8]) -> Option<KeyframeMessage> {
-    const ADDED: usize = 5;
+    const ADDED: usize = 6;
     let completed = |missing: usize| {
         let complete = [bytes, &[0; ADDED][..missing]].concat();
         let (message, rest) = postcard::take_from_bytes::<KeyframeMessage>(&complete).ok()?;
         // What was added stands for what is not there, and for nothing else. The last addition comes first.
         let m = &message;
-        let nothing: [bool; ADDED] =
-            [m.session.is_none(), !m.organised, m.depth.is_none(), m.place.is_none(), m.landmarks.is_empty()];
+        let nothing: [bool; ADDED] = [
+            m.up.is_none(),
+            m.session.is_none(),
+            !m.organised,
+            m.depth.is_none(),
+            m.place.is_none(),
+            m.landmarks.is_empty(),
+        ];
         let is_so = rest.is_empty() && nothing.iter().take(missing).all(|nothing| *nothing);
         is_so.then_some(message)
     };
@@ -347,8 +384,9 @@ impl TryFrom<KeyframeMessage> for Keyframe {
         let marks = message.landmarks.iter().enumerate().map(mark).collect::<Result<_, _>>()?;
         let named = |place: PlaceMessage| PlaceDescriptor::new(&place.model, place.metric, place.vector);
         let place = message.place.map(named).transpose()?;
+        let up = message.up.map(|up| Up::new(up.direction, up.sigma_rad)).transpose()?;
         let KeyframeMessage { stamp_ns, covariance_of, points, session, .. } = message;
-        Ok(Self { stamp: Stamp(stamp_ns), session, pose, covariance_of, points, marks, place })
+        Ok(Self { stamp: Stamp(stamp_ns), session, pose, covariance_of, points, marks, place, up })
     }
 }
 
@@ -388,6 +426,12 @@ impl From<&PlaceDescriptor> for PlaceMessage {
     }
 }
 
+impl From<&Up> for UpMessage {
+    fn from(up: &Up) -> Self {
+        Self { direction: (*up.direction()).into(), sigma_rad: up.sigma() }
+    }
+}
+
 impl From<&Keyframe> for KeyframeMessage {
     fn from(keyframe: &Keyframe) -> Self {
         let covariance = keyframe.pose.covariance.matrix();
@@ -403,6 +447,7 @@ impl From<&Keyframe> for KeyframeMessage {
             depth: None,
             organised: false,
             session: keyframe.session,
+            up: keyframe.up.as_ref().map(Into::into),
         }
     }
 }

@@ -17,6 +17,7 @@ fn message() -> KeyframeMessage {
         depth: None,
         organised: false,
         session: None,
+        up: None,
     }
 }
 
@@ -60,9 +61,9 @@ fn a_place_travels_and_is_checked() {
     assert_eq!(serde_json::from_slice::<PlaceMessage>(written).unwrap().model, "");
 }
 
-/// What was added after the points, each a zero byte in a message that has none of it: session, organised, depth, place,
+/// What was added after the points, each a zero byte in a message that has none of it: up, session, organised, depth, place,
 /// landmarks, the last one first.
-const ADDED: usize = 5;
+const ADDED: usize = 6;
 
 #[test]
 fn a_session_travels() {
@@ -77,18 +78,40 @@ fn a_session_travels() {
     assert!(matches!(keyframe(Format::Json, json.to_string().as_bytes()), Err(ObservationError::Json(_))));
 }
 
+fn upright() -> KeyframeMessage {
+    KeyframeMessage { up: Some(UpMessage { direction: [0.6, 0.0, 0.8], sigma_rad: 0.01 }), ..message() }
+}
+
 #[test]
-fn what_was_sent_before_there_were_sessions_places_or_landmarks_is_understood() {
+fn which_way_is_up_travels_and_is_checked() {
+    let json = serde_json::to_vec(&upright()).unwrap();
+    let postcard = postcard::to_stdvec(&upright()).unwrap();
+    let (a, b) = (keyframe(Format::Json, &json).unwrap(), keyframe(Format::Postcard, &postcard).unwrap());
+    assert_eq!(a, b);
+    assert_eq!(a.up, Some(Up::new([0.6, 0.0, 0.8], 0.01).unwrap()));
+    assert_eq!(KeyframeMessage::from(&a).up.map(|up| up.sigma_rad), Some(0.01));
+    let written = br#"{"direction": [0, 0, 1]}"#;
+    assert_eq!(serde_json::from_slice::<UpMessage>(written).unwrap().sigma_rad, UP_SIGMA_RAD);
+    let told = |direction, sigma_rad| {
+        Keyframe::try_from(KeyframeMessage { up: Some(UpMessage { direction, sigma_rad }), ..message() }).map(drop)
+    };
+    assert_eq!(told([0.0, 0.0, 9.81], 0.02), Err(ObservationError::Up(UpError::Length(9.81))));
+    assert_eq!(told([0.0, 0.0, 1.0], 0.6), Err(ObservationError::Up(UpError::Sigma(0.6))));
+    assert!(matches!(told([0.0, f64::NAN, 1.0], 0.02), Err(ObservationError::Up(UpError::Length(_)))));
+}
+
+#[test]
+fn what_was_sent_before_there_were_verticals_sessions_places_or_landmarks_is_understood() {
     let whole = |message: &KeyframeMessage| postcard::to_stdvec(message).unwrap();
     let of = |bytes: &[u8]| keyframe(Format::Postcard, bytes);
     let (plain, marked, placed) = (whole(&message()), whole(&of_landmarks()), whole(&of_a_place()));
-    let told = whole(&of_a_session());
+    let (told, upright) = (whole(&of_a_session()), whole(&upright()));
     assert!(plain.ends_with(&[0; ADDED]) && marked.ends_with(&[0; ADDED - 1]) && placed.ends_with(&[0; ADDED - 2]));
     // Cut before what its session says, it is one of a place.
     let is_placed = |bytes: &[u8], len: usize| {
         (placed.len() - (ADDED - 2)..placed.len()).contains(&len) && placed.starts_with(&bytes[..len])
     };
-    for (bytes, added) in [(&plain, ADDED), (&marked, ADDED - 1), (&placed, ADDED - 2), (&told, 0)] {
+    for (bytes, added) in [(&plain, ADDED), (&marked, ADDED - 1), (&placed, ADDED - 2), (&told, 1), (&upright, 0)] {
         for missing in 1..=added {
             assert_eq!(of(&bytes[..bytes.len() - missing]), of(bytes));
         }

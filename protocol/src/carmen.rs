@@ -200,7 +200,16 @@ pub fn keyframes<'a>(scans: impl Iterator<Item = &'a Scan>) -> Vec<Keyframe> {
         let Ok(covariance) = Covariance::from_sigmas([along, along, height, tilt, tilt, heading]) else { continue };
         let pose = PoseWithCovariance { pose: scan.pose, covariance };
         let (stamp, covariance_of, points) = (scan.stamp, CovarianceOf::Motion, scan.points.clone());
-        keyframes.push(Keyframe { stamp, session: None, pose, covariance_of, points, marks: Vec::new(), place: None });
+        keyframes.push(Keyframe {
+            stamp,
+            session: None,
+            pose,
+            covariance_of,
+            points,
+            marks: Vec::new(),
+            place: None,
+            up: None,
+        });
     }
     keyframes
 }

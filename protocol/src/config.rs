@@ -4,6 +4,11 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+/// Standard deviation of a vertical that comes without one, about each horizontal axis, rad: what SLAMs with an inertial
+/// sensor reach, and to spare.
+pub const UP_SIGMA_RAD: f64 = 0.02;
+/// Standard deviations of a vertical that may be stated, rad. Below it nothing is mounted so exactly; above it nothing is told.
+pub const UP_SIGMA_RANGE_RAD: core::ops::RangeInclusive<f64> = 1e-3..=0.5;
 /// A pose on a link, bytes (DESIGN §5).
 const POSE_BYTES: f64 = 160.0;
 
@@ -58,6 +63,11 @@ pub struct SubmapConfig {
     pub speed_max_m_s: f64,
     /// The fastest that it turns, likewise; within `rotation_deg`, none is refused.
     pub turn_max_deg_s: f64,
+    /// Who tells which way is up. A pair of submaps that both know it is aligned surer and for less.
+    pub gravity: Gravity,
+    /// Where the frame tells: standard deviation of its z axis from the vertical, about each horizontal axis. Most SLAMs with
+    /// an inertial sensor stay below 0.02; a car's on hilly streets without one below 0.1.
+    pub gravity_sigma_rad: f64,
 }
 
 impl Default for SubmapConfig {
@@ -77,6 +87,8 @@ impl Default for SubmapConfig {
             gap_sigma_per_m: 0.1,
             speed_max_m_s: 50.0,
             turn_max_deg_s: 360.0,
+            gravity: Gravity::Keyframes,
+            gravity_sigma_rad: UP_SIGMA_RAD,
         }
     }
 }
@@ -105,6 +117,17 @@ pub enum Sensor {
     /// heights are left out, and nothing is claimed to be known of height and tilt.
     #[serde(rename = "landmarks_2d")]
     Landmarks2d,
+}
+
+/// Who tells which way is up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Gravity {
+    /// Each keyframe itself, if it says so (`up`).
+    #[default]
+    Keyframes,
+    /// The frame: its z axis points up, as that of SLAMs with an inertial sensor does. A keyframe's own word goes before.
+    FrameZ,
 }
 
 impl Sensor {
@@ -270,6 +293,8 @@ impl Config {
         range("submap.gap_sigma_per_m", s.gap_sigma_per_m, 1e-4, 10.0, "use 0.0001 to 10")?;
         range("submap.speed_max_m_s", s.speed_max_m_s, 0.01, 1e4, "use 0.01 to 10000 m/s")?;
         range("submap.turn_max_deg_s", s.turn_max_deg_s, 1.0, 1e6, "use at least 1 degree per second")?;
+        let up = UP_SIGMA_RANGE_RAD;
+        range("submap.gravity_sigma_rad", s.gravity_sigma_rad, *up.start(), *up.end(), "use 0.001 to 0.5 rad")?;
         range("align.sigma_max_voxels", a.sigma_max_voxels, 0.1, 10.0, "use 0.1 to 10 voxels")?;
         range("align.log10_nfa_max", a.log10_nfa_max, -300.0, 0.0, "use a value from -300 to 0")?;
         range("align.support_min", a.support_min, 3.0, 1e4, "use at least 3")?;

@@ -12,6 +12,9 @@
 //! - `positions.csv` (optional): a header line ([`POSITIONS_HEADER`]), then with stamps that do not fall where other robots
 //!   were seen: `stamp_ns,robot,x,y,z,c00,c01,c02,c11,c12,c22` (the body's origin in the observer's body frame, m, and the
 //!   upper triangle of its covariance). Only robots whose recordings state `begins_ns` can be played so that they meet.
+//! - `up.csv` (optional): a header line ([`UP_HEADER`]), then `stamp_ns,x,y,z,sigma_rad` for each keyframe that knows the
+//!   direction against gravity in the body frame (length 1) and its standard deviation about each horizontal axis. Where
+//!   the SLAM's frame has its z axis upwards, `config.submap.gravity = "frame_z"` in the manifest says so for all.
 //! - the clouds that the keyframes name, relative to the folder, points in the body frame.
 //!
 //! A data set for several robots is a folder whose sub-folders are recordings.
@@ -28,6 +31,8 @@ pub const KEYFRAMES_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,c02,c03,c
 pub const TRUTH_HEADER: &str = "stamp_ns,x,y,z,qx,qy,qz,qw";
 /// First line of `positions.csv`.
 pub const POSITIONS_HEADER: &str = "stamp_ns,robot,x,y,z,c00,c01,c02,c11,c12,c22";
+/// First line of `up.csv`.
+pub const UP_HEADER: &str = "stamp_ns,x,y,z,sigma_rad";
 /// Units that a recording may be in, m.
 pub const UNIT_RANGE_M: core::ops::RangeInclusive<f64> = 1e-3..=1e3;
 /// Keyframes in one recording at most.

@@ -9,7 +9,7 @@ use core::fmt::Write as _;
 use merganser_protocol::geometry::{Covariance, Se3};
 use merganser_protocol::ids::{Name, NameError};
 use merganser_protocol::recording::{
-    CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, PlaceFormat, TRUTH_HEADER, VERSION, XYZ_I16_UNIT_M,
+    CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, PlaceFormat, TRUTH_HEADER, UP_HEADER, VERSION, XYZ_I16_UNIT_M,
 };
 use merganser_protocol::submap::landmarks::DESCRIPTOR_LEN;
 use merganser_protocol::submap::{CovarianceOf, Mark};
@@ -101,6 +101,7 @@ fn record_robot(
     let mut done = Recorded { robot: name.clone(), keyframes: 0, points: 0, bytes: 0, metres: 0.0, secs: 0.0 };
     let mut keyframes = format!("{KEYFRAMES_HEADER}\n");
     let mut truth = format!("{TRUTH_HEADER}\n");
+    let mut ups = format!("{UP_HEADER}\n");
     let mut put = |path: PathBuf, bytes: &[u8]| {
         done.bytes += bytes.len() as u64;
         write_file(path, bytes)
@@ -121,6 +122,10 @@ fn record_robot(
             format = Some(PlaceFormat { model, metric, numbers: place.vector().len() });
         }
         let stamp = FIRST_STAMP_NS.saturating_add_unsigned(step.nanos);
+        if let Some(up) = stage.up(robot, index) {
+            let [x, y, z] = (*up.direction()).into();
+            let _ = writeln!(ups, "{stamp},{x},{y},{z},{}", up.sigma());
+        }
         let odometry = numbers(&pose(&step.t_frame_body), false);
         let covariance = numbers(&triangle(&step.motion.covariance), true);
         let _ = writeln!(keyframes, "{stamp},{odometry},{covariance},{cloud}");
@@ -129,6 +134,9 @@ fn record_robot(
     }
     put(folder.join("keyframes.csv"), keyframes.as_bytes())?;
     put(folder.join("truth.csv"), truth.as_bytes())?;
+    if ups.lines().count() > 1 {
+        put(folder.join("up.csv"), ups.as_bytes())?;
+    }
     if format.is_some() {
         put(folder.join("places.f32"), &places)?;
     }

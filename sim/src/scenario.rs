@@ -255,7 +255,9 @@ impl Scenario {
         range("sensor.range_m[0]", s.range_m[0], 0.0, s.range_m[1], "use shortest, then longest")?;
         range("sensor.range_m[1]", s.range_m[1], 0.1, 60.0, "use 0.1 to 60 m")?;
         range("sensor.range_sigma_m", s.range_sigma_m, 0.0, 1.0, "use 0 to 1 m")?;
-        range("sensor.dropout", s.dropout, 0.0, 1.0, "use 0 to 1")
+        range("sensor.dropout", s.dropout, 0.0, 1.0, "use 0 to 1")?;
+        let gravity = s.gravity_sigma_deg.map(|sigma| range(GRAVITY, sigma, 0.06, 28.0, "use 0.06 to 28 degrees"));
+        gravity.unwrap_or(Ok(()))
     }
 
     fn validate_landmarks(&self) -> Result<(), ScenarioError> {
@@ -296,6 +298,9 @@ impl Scenario {
         })
     }
 }
+
+/// What agents take is between 0.001 and 0.5 rad.
+const GRAVITY: &str = "sensor.gravity_sigma_deg";
 
 fn range(key: &str, value: f64, low: f64, high: f64, mend: &'static str) -> Result<(), ScenarioError> {
     if (low..=high).contains(&value) {
@@ -339,6 +344,8 @@ mod tests {
             ),
             ("[radio]\nlayout = \"star\"", "star", "expected one of"),
             ("[sensor]\nrange_m = [5.0, 1.0]", "sensor.range_m[0] = 5", "shortest"),
+            ("[sensor]\ngravity_sigma_deg = 0.05", "sensor.gravity_sigma_deg = 0.05", "0.06 to 28"),
+            ("[sensor]\ngravity_sigma_deg = 28.1", "sensor.gravity_sigma_deg = 28.1", "0.06 to 28"),
             ("[config.submap]\nvoxel_m = 0.0", "config.submap.voxel_m = 0", "0.001 to 10"),
             ("[config]\nvoxel = 1", "voxel", "unknown field"),
             ("[landmarks]", "config.submap.sensor = Points3d", "go together"),

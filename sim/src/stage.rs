@@ -10,9 +10,11 @@ use crate::world::path::Path;
 use crate::world::places::{PlaceOptions, Places};
 use crate::world::sensor::Sensor;
 use crate::world::trajectory::{Trajectory, TrajectoryError};
-use merganser_protocol::geometry::{CovarianceError, Se3};
-use merganser_protocol::submap::PlaceDescriptor;
+use core::f64::consts::FRAC_1_SQRT_2;
+use merganser_protocol::geometry::{CovarianceError, Se3, So3};
+use merganser_protocol::submap::{PlaceDescriptor, Up};
 use merganser_protocol::wire::fact::ScaleKind;
+use nalgebra::Vector3;
 use thiserror::Error;
 
 /// World, drives and sensor.
@@ -30,6 +32,8 @@ pub struct Stage {
     units_m: Vec<f64>,
     /// Points of a made-up scan, at summary level.
     made_up: Option<usize>,
+    /// Of an inertial sensor, rad.
+    gravity_sigma: Option<f64>,
     steps: Vec<Vec<Step>>,
 }
 
@@ -93,7 +97,8 @@ impl Stage {
         let places = scenario.places.as_ref().map(of_network);
         let made_up = scenario.summary.as_ref().map(|summary| summary.points);
         let sensor = Sensor::new(scenario.sensor.clone());
-        Ok(Self { seed, names, world, sensor, camera, places, units_m, made_up, steps })
+        let gravity_sigma = scenario.sensor.gravity_sigma_deg.map(f64::to_radians);
+        Ok(Self { seed, names, world, sensor, camera, places, units_m, made_up, gravity_sigma, steps })
     }
 
     /// The robots' names.
@@ -123,6 +128,20 @@ impl Stage {
         self.places.as_ref()?.look(&at, &mut dice).ok()
     }
 
+    /// What one keyframe takes for up, if an inertial sensor tells: off by what all of the robot's have in common, and by a draw
+    /// of its own.
+    pub fn up(&self, robot: usize, index: usize) -> Option<Up> {
+        let sigma = self.gravity_sigma?;
+        let draw = |label: String| {
+            let mut dice = Dice::new(self.seed, &label);
+            Vector3::from_fn(|_, _| dice.normal())
+        };
+        let off = draw(format!("up {robot}")) + draw(format!("up {robot} {index}"));
+        let r_body_world = self.steps[robot][index].t_world_body.rotation.inverse();
+        let seen = So3::exp(&(off * (sigma * FRAC_1_SQRT_2))) * (r_body_world * Vector3::z());
+        Up::new(seen.into(), sigma).ok()
+    }
+
     /// The points of one keyframe, body frame, in its SLAM's unit, and a mark for each if they are landmarks.
     ///
     /// # Errors
@@ -137,5 +156,32 @@ impl Stage {
             Some(camera) => camera.look(&self.world, t_world_body, self.units_m[robot], &mut dice),
             None => Ok((self.sensor.scan(&self.world, t_world_body, &mut dice), Vec::new())),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_inertial_sensor_tells_what_is_up_to_what_it_says() {
+        let minimal = "name = \"x\"\nrobots = 2\nduration_secs = 60\n";
+        let stage = |extra: &str| Stage::new(&Scenario::parse(&format!("{minimal}{extra}")).unwrap(), 3).unwrap();
+        let (without, with) = (stage(""), stage("[sensor]\ngravity_sigma_deg = 2.0"));
+        assert_eq!(without.up(0, 0), None);
+        // Nothing else of the stage depends on it.
+        assert_eq!(without.scan(1, 3).unwrap(), with.scan(1, 3).unwrap());
+        let off = |robot: usize, index: usize| {
+            let up = with.up(robot, index).unwrap();
+            let truth = with.steps(robot)[index].t_world_body.rotation.inverse() * Vector3::z();
+            up.direction().cross(&truth).norm() / up.sigma()
+        };
+        let all: Vec<f64> = (0..2)
+            .flat_map(|robot| (0..with.steps(robot).len()).map(move |k| (robot, k)))
+            .map(|(r, k)| off(r, k))
+            .collect();
+        assert!(all.iter().all(|&off| off > 0.0 && off < 5.0), "{all:?}");
+        let square = all.iter().map(|off| off * off).sum::<f64>() / all.len() as f64;
+        assert!((0.5..5.0).contains(&square), "two axes: {square}");
     }
 }

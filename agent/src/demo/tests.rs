@@ -377,7 +377,16 @@ pub(super) fn record(tracks: &[Track], folder: &Path) -> Vec<Recording> {
             let covariance_of = CovarianceOf::Motion;
             writer
                 .push(
-                    &Keyframe { stamp, session: None, pose, covariance_of, points, marks: vec![], place: None },
+                    &Keyframe {
+                        stamp,
+                        session: None,
+                        pose,
+                        covariance_of,
+                        points,
+                        marks: vec![],
+                        place: None,
+                        up: None,
+                    },
                     Some(truth),
                 )
                 .unwrap();

@@ -35,6 +35,7 @@ fn of(depth: DepthMessage) -> KeyframeMessage {
         depth: Some(depth),
         organised: false,
         session: None,
+        up: None,
     }
 }
 

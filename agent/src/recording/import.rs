@@ -180,6 +180,7 @@ impl Cut<'_> {
                     points: points(scan)?,
                     marks: vec![],
                     place: None,
+                    up: None,
                 };
                 writer.push(&keyframe, Some(&scan.truth))?;
             }

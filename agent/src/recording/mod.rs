@@ -27,7 +27,7 @@ pub use write::Writer;
 use error::on;
 use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, Manifest, UNIT_RANGE_M, VERSION};
-use merganser_protocol::submap::Keyframe;
+use merganser_protocol::submap::{Keyframe, Up};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::ScaleKind;
 use std::io::Read;
@@ -41,6 +41,8 @@ pub const KEYFRAMES: &str = "keyframes.csv";
 pub const TRUTH: &str = "truth.csv";
 /// Name of the table of where other robots were seen.
 pub const POSITIONS: &str = "positions.csv";
+/// Name of the table of what is up.
+pub const UPS: &str = "up.csv";
 /// Name of the file of place descriptors.
 pub const PLACES: &str = "places.f32";
 /// Time from the beginning of a data set to a robot's first keyframe, s, at most.
@@ -56,6 +58,8 @@ pub struct Recording {
     keyframes: Vec<KeyframeLine>,
     truth: Option<Vec<TruthLine>>,
     positions: Vec<PositionSighting>,
+    /// Which way each keyframe has up; none at all without the table.
+    ups: Vec<Option<Up>>,
 }
 
 impl Recording {
@@ -88,7 +92,9 @@ impl Recording {
         }
         let positions = folder.join(POSITIONS);
         let positions = if positions.exists() { table::read_positions(&positions)? } else { Vec::new() };
-        Ok(Self { folder: folder.into(), manifest, keyframes, truth, positions })
+        let ups = folder.join(UPS);
+        let ups = if ups.exists() { table::read_ups(&ups, &keyframes)? } else { Vec::new() };
+        Ok(Self { folder: folder.into(), manifest, keyframes, truth, positions, ups })
     }
 
     /// Reads every cloud once, to find a bad one before any use.
@@ -175,7 +181,8 @@ impl Recording {
             Some(format) => places::read(&self.folder.join(PLACES), format, index)?,
             None => None,
         };
-        Ok(Keyframe { stamp: line.stamp, session: None, pose: line.pose, covariance_of, points, marks, place })
+        let up = self.ups.get(index).copied().flatten();
+        Ok(Keyframe { stamp: line.stamp, session: None, pose: line.pose, covariance_of, points, marks, place, up })
     }
 
     fn line(&self, index: usize) -> Result<&KeyframeLine, RecordingError> {

@@ -116,6 +116,7 @@ mod tests {
                 points: vec![[1.0; 3]],
                 marks: vec![],
                 place: place.clone(),
+                up: None,
             };
             writer.push(&keyframe, None)?;
         }

@@ -1,4 +1,4 @@
-//! `keyframes.csv` and `truth.csv`: strict tables of numbers. A line that is not exactly what the header promises
+//! `keyframes.csv`, `truth.csv` and their like: strict tables of numbers. A line that is not exactly what the header promises
 //! refuses the recording; nothing is guessed or skipped.
 
 use super::error::{Problem, RecordingError, on};
@@ -6,7 +6,8 @@ use crate::observation::{COORDINATE_MAX, PositionMessage};
 use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::Name;
-use merganser_protocol::recording::{KEYFRAMES_HEADER, KEYFRAMES_MAX, POSITIONS_HEADER, TRUTH_HEADER};
+use merganser_protocol::recording::{KEYFRAMES_HEADER, KEYFRAMES_MAX, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER};
+use merganser_protocol::submap::Up;
 use merganser_protocol::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
 use std::fs::File;
@@ -90,6 +91,30 @@ pub(super) fn read_positions(path: &Path) -> Result<Vec<PositionSighting>, Recor
         Ok(())
     })?;
     Ok(lines)
+}
+
+/// Reads `up.csv`: of each keyframe of the recording that it names, in their order, what it takes for up.
+pub(super) fn read_ups(path: &Path, keyframes: &[KeyframeLine]) -> Result<Vec<Option<Up>>, RecordingError> {
+    let mut ups = vec![None; keyframes.len()];
+    let mut later = 0;
+    read(path, UP_HEADER, |fields| {
+        let stamp = stamp(fields[0])?;
+        let mut values = [0.0; 4];
+        for ((value, text), column) in values.iter_mut().zip(&fields[1..]).zip(UP_HEADER.split(',').skip(1)) {
+            *value = number(column, text)?;
+        }
+        let [x, y, z, sigma_rad] = values;
+        let up = Up::new([x, y, z], sigma_rad).map_err(|error| Problem::Data(error.to_string()))?;
+        let after = keyframes[later..].iter().position(|line| line.stamp == stamp);
+        let Some(after) = after else {
+            let said = format!("no keyframe after the one of the line above has the stamp {}", stamp.0);
+            return Err(Problem::Data(said));
+        };
+        ups[later + after] = Some(up);
+        later += after + 1;
+        Ok(())
+    })?;
+    Ok(ups)
 }
 
 /// Calls `take` with the fields of each line after the header, whose number of columns they have.

@@ -3,8 +3,8 @@ use super::*;
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
 use merganser_protocol::ids::Name;
-use merganser_protocol::recording::CloudFormat;
-use merganser_protocol::submap::CovarianceOf;
+use merganser_protocol::recording::{CloudFormat, UP_HEADER};
+use merganser_protocol::submap::{CovarianceOf, Up};
 use merganser_protocol::time::Stamp;
 use nalgebra::Vector6;
 use std::fs;
@@ -42,6 +42,8 @@ fn write_good(folder: &Path, robot: &str) {
             points,
             marks: vec![],
             place: None,
+            // A vertical that reads back to the bit: of length 1 without rounding.
+            up: (i % 2 == 1).then(|| Up::new([0.0, 0.0, 1.0 - 2.0 * f64::from(i / 2)], 0.03).unwrap()),
         };
         writer.push(&keyframe, Some(&pose.pose.inverse())).unwrap();
     }
@@ -108,6 +110,8 @@ fn a_written_recording_reads_back_to_the_bit() {
     assert_eq!(third.covariance_of, CovarianceOf::Pose);
     assert_eq!(recording.truth().unwrap()[3].stamp, Stamp(1003));
     assert!(recording.keyframe(4).is_err());
+    let up = |index| recording.keyframe(index).unwrap().up.map(|up| (up.direction().z, up.sigma()));
+    assert_eq!([0, 1, 2, 3].map(up), [None, Some((1.0, 0.03)), None, Some((-1.0, 0.03))]);
     assert_eq!(recording.begins(), Stamp(900));
     let seen: Vec<(i64, &str, f64)> =
         recording.positions().iter().map(|p| (p.stamp.0, p.robot.as_str(), p.position[2])).collect();
@@ -361,4 +365,15 @@ fn a_lidar_dump_becomes_two_robots() {
 fn real_ply_files_read() {
     let Some(data) = shared("pair_small_gicp") else { return };
     assert_eq!(cloud::read(&data.join("source.ply"), CloudFormat::Ply).unwrap().len(), 69_792);
+}
+
+#[test]
+fn verticals_are_of_keyframes_in_their_order() {
+    let spoilt = |line, column, value| refused(|dir| set_field(&dir.join(UPS), line, column, value));
+    expect(&spoilt(1, 0, "1000000"), UPS, Some(2), "no keyframe");
+    expect(&spoilt(2, 0, "1001"), UPS, Some(3), "no keyframe");
+    expect(&spoilt(2, 3, "9.81"), UPS, Some(3), "length 9.81");
+    expect(&spoilt(1, 4, "0.7"), UPS, Some(2), "0.7 rad");
+    expect(&spoilt(1, 2, "nan"), UPS, Some(2), "y");
+    expect(&spoilt(0, 4, "sigma"), UPS, Some(1), UP_HEADER);
 }

@@ -5,10 +5,12 @@ use super::cloud;
 use super::error::{Problem, RecordingError, on};
 use super::landmarks;
 use super::places::Rows;
-use super::{KEYFRAMES, MANIFEST, PLACES, POSITIONS, TRUTH};
+use super::{KEYFRAMES, MANIFEST, PLACES, POSITIONS, TRUTH, UPS};
 use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::geometry::Se3;
-use merganser_protocol::recording::{FORMAT, KEYFRAMES_HEADER, Manifest, POSITIONS_HEADER, TRUTH_HEADER, VERSION};
+use merganser_protocol::recording::{
+    FORMAT, KEYFRAMES_HEADER, Manifest, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER, VERSION,
+};
 use merganser_protocol::submap::Keyframe;
 use std::fmt::Write as _;
 use std::fs;
@@ -26,6 +28,7 @@ pub struct Writer {
     truth: String,
     places: Rows,
     positions: String,
+    ups: String,
 }
 
 impl Writer {
@@ -39,7 +42,8 @@ impl Writer {
         let manifest = Manifest { format: FORMAT.into(), version: VERSION, keyframes: 0, ..manifest };
         let (keyframes, truth) = (format!("{KEYFRAMES_HEADER}\n"), format!("{TRUTH_HEADER}\n"));
         let positions = format!("{POSITIONS_HEADER}\n");
-        Ok(Self { folder: folder.into(), manifest, keyframes, truth, places: Rows::default(), positions })
+        let (places, ups) = (Rows::default(), format!("{UP_HEADER}\n"));
+        Ok(Self { folder: folder.into(), manifest, keyframes, truth, places, positions, ups })
     }
 
     /// Adds a keyframe, with `t_world_body` where it is known: for all keyframes or for none.
@@ -58,6 +62,10 @@ impl Writer {
         let bytes = bytes.map_err(|problem| problem.of(&path))?;
         on(&path, fs::write(&path, bytes))?;
         self.places.push(keyframe.place.as_ref()).map_err(|problem| problem.of(self.folder.join(PLACES)))?;
+        if let Some(up) = &keyframe.up {
+            let [x, y, z] = (*up.direction()).into();
+            let _ = writeln!(self.ups, "{},{x},{y},{z},{}", keyframe.stamp.0, up.sigma());
+        }
         line(&mut self.keyframes, keyframe.stamp.0, &keyframe.pose.pose);
         let p = keyframe.pose.covariance.matrix();
         for (row, column) in (0..6).flat_map(|row| (row..6).map(move |column| (row, column))) {
@@ -98,6 +106,9 @@ impl Writer {
         }
         if self.positions.lines().count() > 1 {
             write(POSITIONS, self.positions.as_bytes())?;
+        }
+        if self.ups.lines().count() > 1 {
+            write(UPS, self.ups.as_bytes())?;
         }
         let truths = self.truth.lines().count() - 1;
         if truths != 0 {

@@ -169,5 +169,6 @@ pub fn keyframe(robot: u64, index: u64) -> Keyframe {
         points: points.collect(),
         marks: Vec::new(),
         place: None,
+        up: None,
     }
 }

@@ -12,7 +12,7 @@ use super::shortlist::Candidate;
 use crate::config::AlignConfig;
 use crate::geometry::Relative;
 use crate::ids::{EntryId, Hash, RobotId, SubmapId};
-use crate::submap::{Keypoints, Summary};
+use crate::submap::{Keypoints, Summary, Verticals};
 use crate::time::Instant;
 use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, VerdictFact, VerdictOutcome};
 use core::time::Duration;
@@ -192,12 +192,19 @@ impl Agent {
             config: self.config.align.clone(),
             voxel_m: self.config.submap.voxel_m,
             sensor: self.config.submap.sensor,
+            verticals: self.verticals(mine, theirs),
             scale: if metric { ScaleKind::Metric } else { ScaleKind::Unknown },
             seed: self.pair_seed(pair_of(mine, theirs)),
         };
         let id = self.run_job(Job::Align(Box::new(job)));
         self.negotiation.running.insert(id, Work { mine, theirs, purpose });
         true
+    }
+
+    /// Which way is up, as both submaps' summaries have it: what everyone who aligns the pair reckons with.
+    fn verticals(&self, mine: SubmapId, theirs: SubmapId) -> Option<Verticals> {
+        let up = |id| self.knowledge.submap(id)?.summary.as_ref()?.up();
+        Verticals::of(up(theirs), up(mine))
     }
 
     /// Both submaps are ours: nobody else will look at the pair.

@@ -13,6 +13,7 @@ use crate::submap::landmarks::{self, LandmarkConfig};
 use crate::submap::planar::FlatConfig;
 use crate::submap::{
     self, Described, Features, Keypoints, RefineConfig, RefineError, RegisterConfig, RegisterError, Registered, Submap,
+    Verticals,
 };
 use crate::wire::fact::{RefusalReason, ScaleKind};
 use std::collections::BTreeMap;
@@ -57,6 +58,8 @@ pub struct AlignJob {
     pub voxel_m: f64,
     /// What made our points.
     pub sensor: Sensor,
+    /// Which way is up, if both submaps know.
+    pub verticals: Option<Verticals>,
     /// SE(3), or SIM(3) if either side's unit is unknown.
     pub scale: ScaleKind,
     /// Seed of the sampler: our own, so that the two endpoints are independent.
@@ -219,9 +222,9 @@ impl SolveJob {
 
 impl AlignJob {
     fn run(&self) -> Result<Measured, RefusalReason> {
-        let there = self.one_way(&self.theirs, &self.mine)?;
+        let there = self.one_way(&self.theirs, &self.mine, self.verticals)?;
         let Some((keypoints, features)) = &self.back else { return Ok(there) };
-        let back = self.one_way(keypoints, features)?;
+        let back = self.one_way(keypoints, features, self.verticals.map(Verticals::back))?;
         let t_mine_theirs = back.t_mine_theirs.inverse();
         if !two_sided::agree(&there.t_mine_theirs, &t_mine_theirs) {
             return Err(RefusalReason::Ambiguous);
@@ -237,7 +240,12 @@ impl AlignJob {
 
     /// Where units are metres, clouds judge the poses that matches suggest; else the matches alone decide. In the plane
     /// all poses are tried.
-    fn one_way(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, RefusalReason> {
+    fn one_way(
+        &self,
+        theirs: &Keypoints,
+        mine: &Features,
+        verticals: Option<Verticals>,
+    ) -> Result<Measured, RefusalReason> {
         match (self.sensor, self.scale) {
             (Sensor::Laser2d, ScaleKind::Metric) => {
                 self.measured(submap::planar::register(theirs, mine, &FlatConfig::default()))
@@ -245,9 +253,9 @@ impl AlignJob {
             // In the plane nobody tells a scale.
             (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput),
             (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(theirs, mine, true),
-            (Sensor::Landmarks, _) => self.landmarks(theirs, mine, false),
-            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Metric) => self.register(theirs, mine),
-            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Unknown) => self.align(theirs, mine),
+            (Sensor::Landmarks, _) => upright(self.landmarks(theirs, mine, false)?, verticals),
+            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Metric) => self.register(theirs, mine, verticals),
+            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Unknown) => upright(self.align(theirs, mine)?, verticals),
         }
     }
 
@@ -258,11 +266,17 @@ impl AlignJob {
         Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
     }
 
-    fn register(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, RefusalReason> {
+    fn register(
+        &self,
+        theirs: &Keypoints,
+        mine: &Features,
+        verticals: Option<Verticals>,
+    ) -> Result<Measured, RefusalReason> {
         let config = RegisterConfig {
             solver: self.solver(),
             fit_min: self.config.fit_min,
             refine: RefineConfig::of(self.sensor),
+            verticals,
             ..RegisterConfig::default()
         };
         self.measured(submap::register(theirs, mine, &config))
@@ -270,7 +284,7 @@ impl AlignJob {
 
     fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, RefusalReason> {
         let found = found.map_err(|error| match error {
-            RegisterError::NoConsensus { .. } => RefusalReason::NoConsensus,
+            RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. } => RefusalReason::NoConsensus,
             RegisterError::Ambiguous { .. } => RefusalReason::Ambiguous,
             RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate,
             RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit,
@@ -325,5 +339,18 @@ impl AlignJob {
             seed: self.seed,
             ..SolverConfig::default()
         }
+    }
+}
+
+/// What matches alone decided, unless it tilts one submap's vertical against the other's.
+fn upright(measured: Measured, verticals: Option<Verticals>) -> Result<Measured, RefusalReason> {
+    let (rotation, covariance) = match &measured.t_mine_theirs {
+        Relative::Metric(p) => (p.pose.rotation, p.covariance.matrix().fixed_view::<3, 3>(3, 3).into_owned()),
+        Relative::Similarity(s) => (s.sim.rotation, s.covariance.matrix().fixed_view::<3, 3>(3, 3).into_owned()),
+    };
+    let sigma = covariance.symmetric_eigenvalues().max().sqrt();
+    match verticals {
+        Some(known) if !known.allow(&rotation.matrix(), sigma) => Err(RefusalReason::NoConsensus),
+        _ => Ok(measured),
     }
 }

@@ -1,8 +1,8 @@
 use super::job::*;
 use crate::config::{AlignConfig, Sensor};
-use crate::geometry::Relative;
-use crate::submap::Described;
+use crate::geometry::{Relative, So3};
 use crate::submap::testing::{config, moved_room, room};
+use crate::submap::{Described, Up, Verticals};
 use crate::wire::fact::{RefusalReason, ScaleKind};
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -13,6 +13,15 @@ fn moved(turn: f64, x: f64) -> Described {
 
 /// A loop between a room and the same room seen from elsewhere, looked at from there as `back` sees it.
 fn closed(theirs: &Described, back: Option<&Described>) -> Result<Measured, RefusalReason> {
+    aligned(theirs, back, ScaleKind::Metric, None)
+}
+
+fn aligned(
+    theirs: &Described,
+    back: Option<&Described>,
+    scale: ScaleKind,
+    verticals: Option<Verticals>,
+) -> Result<Measured, RefusalReason> {
     let mine = room(6);
     let job = AlignJob {
         theirs: Arc::new(theirs.keypoints.clone()),
@@ -21,7 +30,8 @@ fn closed(theirs: &Described, back: Option<&Described>) -> Result<Measured, Refu
         config: AlignConfig::default(),
         voxel_m: config().voxel_m,
         sensor: Sensor::Points3d,
-        scale: ScaleKind::Metric,
+        verticals,
+        scale,
         seed: 1,
     };
     let JobResult::Aligned(answer) = Job::Align(Box::new(job)).run() else { panic!("another job's result") };
@@ -47,4 +57,22 @@ fn a_loop_that_looks_otherwise_from_its_other_end_is_ambiguous() {
     assert!(closed(&moved(1.2, 0.6), None).is_ok(), "from elsewhere the room is found as well");
     assert_eq!(closed(&theirs, Some(&moved(1.2, 0.6))).unwrap_err(), RefusalReason::Ambiguous);
     assert_eq!(closed(&theirs, Some(&room(7))).unwrap_err(), RefusalReason::NoConsensus);
+}
+
+#[test]
+fn what_is_upright_stays_so_at_both_ends_and_in_any_unit() {
+    let (theirs, t_theirs_mine) = moved_room(6, Vector3::new(0.1, -0.2, 1.2), Vector3::new(0.3, 0.1, 0.05));
+    let up = |direction: Vector3<f64>| Up::new(direction.into(), 0.02).unwrap();
+    let verticals = |tilt: f64| {
+        let tilted = So3::exp(&Vector3::new(0.0, tilt, 0.0)) * Vector3::z();
+        Some(Verticals { theirs: up(t_theirs_mine.rotation * Vector3::z()), mine: up(tilted) })
+    };
+    for back in [None, Some(&theirs)] {
+        assert!(aligned(&theirs, back, ScaleKind::Metric, verticals(0.0)).is_ok());
+        let tilted = aligned(&theirs, back, ScaleKind::Metric, verticals(0.35));
+        assert_eq!(tilted.unwrap_err(), RefusalReason::NoConsensus);
+    }
+    assert!(aligned(&theirs, None, ScaleKind::Unknown, verticals(0.0)).is_ok());
+    let tilted = aligned(&theirs, None, ScaleKind::Unknown, verticals(0.35));
+    assert_eq!(tilted.unwrap_err(), RefusalReason::NoConsensus);
 }

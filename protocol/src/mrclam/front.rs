@@ -115,6 +115,7 @@ pub fn keyframes(speeds: &[Speed], sightings: &[Sighting]) -> Vec<Keyframe> {
             points,
             marks,
             place: None,
+            up: None,
         });
     }
     keyframes

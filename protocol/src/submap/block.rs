@@ -255,14 +255,22 @@ fn stored<const N: usize>(bytes: &[u8]) -> Option<Stored<N>> {
 
 /// A unit vector as a point of the unfolded octahedron (Cigolle et al. 2014), about 0.5° apart.
 fn octahedral(n: &Vector3<f64>) -> [u8; 2] {
-    let sum = n.x.abs() + n.y.abs() + n.z.abs();
-    let (x, y) = (n.x / sum, n.y / sum);
-    let (x, y) = if n.z < 0.0 { (fold(x, y), fold(y, x)) } else { (x, y) };
-    [x, y].map(|c| ((c + 1.0) * OCTAHEDRAL_HALF).round().clamp(0.0, 2.0 * OCTAHEDRAL_HALF) as u8)
+    unfolded(n).map(|c| ((c + 1.0) * OCTAHEDRAL_HALF).round().clamp(0.0, 2.0 * OCTAHEDRAL_HALF) as u8)
 }
 
 fn from_octahedral(code: [u8; 2]) -> Vector3<f64> {
-    let [x, y] = code.map(|c| f64::from(c) / OCTAHEDRAL_HALF - 1.0);
+    folded(code.map(|c| f64::from(c) / OCTAHEDRAL_HALF - 1.0))
+}
+
+/// Where a unit vector lies on the unfolded octahedron: two coordinates from -1 to 1.
+pub(super) fn unfolded(n: &Vector3<f64>) -> [f64; 2] {
+    let sum = n.x.abs() + n.y.abs() + n.z.abs();
+    let (x, y) = (n.x / sum, n.y / sum);
+    if n.z < 0.0 { [fold(x, y), fold(y, x)] } else { [x, y] }
+}
+
+/// The unit vector there.
+pub(super) fn folded([x, y]: [f64; 2]) -> Vector3<f64> {
     let z = 1.0 - x.abs() - y.abs();
     let (x, y) = if z < 0.0 { (fold(x, y), fold(y, x)) } else { (x, y) };
     Vector3::new(x, y, z).normalize()

@@ -9,6 +9,7 @@
 //! from the middle one only w/12; the joint estimate reckons with that (see [`distortion`](crate::estimate::distortion)).
 
 use super::continuity::{Continuity, FrameSign};
+use super::gravity::{self, Up};
 use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
 use super::misfit::{Misfits, Views};
 use super::odometry::{across_gap_after, isotropic, motion};
@@ -16,7 +17,7 @@ use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
 use super::thinning::Thinner;
 use super::{Keyframe, KeyframeError, Mark, PlaceDescriptor, PoseWithCovariance};
-use crate::config::{Sensor, SubmapConfig};
+use crate::config::{Gravity, Sensor, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
@@ -53,6 +54,8 @@ pub struct Submap {
     pub constellation: Constellation,
     /// What the user's own place recognition says of it.
     pub place: Option<Place>,
+    /// Which way is up, in the anchor frame, as far as it is known.
+    pub up: Option<Up>,
 }
 
 /// Cuts keyframes into submaps; see the [module](self).
@@ -97,6 +100,8 @@ struct Open {
     landmarks: Gatherer,
     place: PlaceMean,
     views: Views,
+    /// Which way each keyframe has up.
+    ups: Vec<Option<Up>>,
 }
 
 impl SubmapBuilder {
@@ -279,6 +284,7 @@ impl SubmapBuilder {
     /// Adds `keyframe` to the open submap, which it begins if none is open.
     fn extend(&mut self, keyframe: &Keyframe) {
         let t_frame_body = self.t_frame_body;
+        let up = self.up(keyframe);
         let open = self.open.get_or_insert_with(|| {
             let at_origin = isotropic(FIRST_ANCHOR_SIGMA, FIRST_ANCHOR_SIGMA, &keyframe.pose.covariance);
             let first = PoseWithCovariance { pose: t_frame_body, covariance: at_origin };
@@ -293,6 +299,7 @@ impl SubmapBuilder {
                 landmarks: Gatherer::new(self.config.voxel_m, self.config.points_max),
                 place: PlaceMean::default(),
                 views: Views::default(),
+                ups: Vec::new(),
             }
         });
         let t_first_body = open.t_frame_first.inverse() * t_frame_body;
@@ -300,6 +307,7 @@ impl SubmapBuilder {
         let position = u16::try_from(open.keyframes.len()).unwrap_or(u16::MAX);
         open.keyframes.push(t_first_body);
         keyframe.place.iter().for_each(|place| open.place.add(place));
+        open.ups.push(up);
         match self.config.sensor {
             Sensor::Landmarks => open.landmarks.add(position, &t_first_body, &keyframe.points, &keyframe.marks),
             Sensor::Landmarks2d => {
@@ -317,6 +325,19 @@ impl SubmapBuilder {
         let is_flat = self.config.sensor == Sensor::Laser2d;
         let height = |p: &[f32; 3]| if is_flat { [p[0], p[1], 0.0] } else { *p };
         open.cloud.add(keyframe.points.iter().map(|p| moved(&t_first_body, height(p).map(f64::from))), position);
+    }
+
+    /// Which way is up: as the keyframe says itself, or its frame.
+    fn up(&self, keyframe: &Keyframe) -> Option<Up> {
+        let SubmapConfig { sensor, gravity, gravity_sigma_rad, .. } = self.config;
+        match gravity {
+            _ if sensor.is_planar() => None,
+            Gravity::Keyframes => keyframe.up,
+            Gravity::FrameZ => {
+                let of_frame = || Up::of_frame_z(&keyframe.pose.pose.rotation, gravity_sigma_rad).ok();
+                keyframe.up.or_else(of_frame)
+            }
+        }
     }
 
     fn is_complete(&self) -> bool {
@@ -376,6 +397,7 @@ impl Open {
         let odometry = self.odometry_to_anchor();
         let anchor = self.middle();
         let keyframes: Vec<Se3> = self.keyframes.iter().map(|t_first_body| t_anchor_first * *t_first_body).collect();
+        let up = gravity::mean(&self.ups, &keyframes, &self.motions, anchor);
         let constellation = settle(&self.landmarks.finish(), &self.motions, &keyframes, anchor);
         let (mut cloud, seen_from) = self.cloud.finish();
         let about_anchor = |p: [f32; 3]| moved(&t_anchor_first, p.map(f64::from)).map(|x| x as f32);
@@ -391,6 +413,7 @@ impl Open {
             seen_from,
             constellation,
             place: self.place.finish(),
+            up,
         }
     }
 

@@ -40,7 +40,7 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
         Sensor::Laser2d => planar::describe(submap, config),
         Sensor::Landmarks | Sensor::Landmarks2d => landmarks::describe(submap, config),
     };
-    Described { summary: described.summary.at(submap.place.clone()), ..described }
+    Described { summary: described.summary.at(submap.place.clone()).upright(submap.up), ..described }
 }
 
 fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {

@@ -18,6 +18,7 @@ mod court;
 pub mod describe;
 mod descriptor;
 pub mod features;
+pub mod gravity;
 mod grid;
 mod hypotheses;
 pub mod landmarks;
@@ -45,6 +46,7 @@ pub use block::{BlockError, Surfel};
 pub use builder::{Submap, SubmapBuilder};
 pub use describe::{Described, describe};
 pub use features::{Features, Keypoints};
+pub use gravity::{Up, UpError, Verticals};
 pub use landmarks::Mark;
 pub use matching::{Matches, fit, match_keypoints};
 pub use place::{PlaceDescriptor, PlaceError};
@@ -74,6 +76,8 @@ pub struct Keyframe {
     pub marks: Vec<Mark>,
     /// What the user's own place recognition says of it, if it has one.
     pub place: Option<PlaceDescriptor>,
+    /// Which way is up, in the body frame, if it is known. Planar robots' is not asked for.
+    pub up: Option<Up>,
 }
 
 /// What a keyframe's covariance describes.

@@ -22,6 +22,8 @@ pub const MODEL_LEN_MAX: usize = 64;
 pub const NUMBER_MAX: f32 = 1e6;
 /// Shortest vector that has a direction.
 const LENGTH_MIN: f64 = 1e-6;
+/// Numbers at most beside what is known of the vertical, which must find room as well; the last of more are left out.
+const NUMBERS_BESIDE_UP_MAX: usize = NUMBERS_MAX - 4;
 /// Bytes before the numbers: metric, kind, size of one step.
 const HEADER_LEN: usize = 9;
 /// Bytes of an encoded place at most.
@@ -33,7 +35,12 @@ const STEP_MIN: f64 = 1e-12;
 /// ...and largest: [`VECTOR_LEN_MAX`] of the largest numbers in one place.
 const STEP_MAX: f32 = 1e9;
 
+/// The same beside what is known of the vertical.
+pub(super) const LEN_BESIDE_UP_MAX: usize = HEADER_LEN + NUMBERS_BESIDE_UP_MAX;
+
 const _: () = assert!(super::summary::HEADER_LEN + WORDS + LEN_MAX <= super::SUMMARY_LEN_MAX);
+const _: () =
+    assert!(super::summary::HEADER_LEN + WORDS + super::gravity::LEN + LEN_BESIDE_UP_MAX <= super::SUMMARY_LEN_MAX);
 
 /// How two vectors are compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -198,9 +205,31 @@ impl Place {
     /// How alike two places are, 0 to 1 (equal), as their metric has it: the cosine, or how far they are from one another
     /// beside how far they can be, `1 − d / (|a| + |b|)`. `None` if they are of different kinds.
     pub(super) fn similarity(&self, other: &Self) -> Option<f64> {
-        if self.kind != other.kind || self.numbers.len() != other.numbers.len() {
+        if self.kind != other.kind {
             return None;
         }
+        if self.numbers.len() != other.numbers.len() {
+            return self.first(NUMBERS_BESIDE_UP_MAX)?.similarity_of_equals(&other.first(NUMBERS_BESIDE_UP_MAX)?);
+        }
+        self.similarity_of_equals(other)
+    }
+
+    /// The first `count` of its numbers, scaled as they must be; `None` if it has fewer or they are zero.
+    fn first(&self, count: usize) -> Option<Self> {
+        let numbers = self.numbers.get(..count)?;
+        let most = numbers.iter().map(|x| x.unsigned_abs()).max().filter(|&most| most > 0)?;
+        let scale = f64::from(STEPS) / f64::from(most);
+        let scaled = numbers.iter().map(|&x| (f64::from(x) * scale).round() as i8).collect();
+        let step = (f64::from(self.step) / scale).max(STEP_MIN);
+        Some(Self::new(self.kind, step as f32, scaled))
+    }
+
+    /// What of it finds room beside what is known of the vertical.
+    pub(super) fn beside_up(self) -> Option<Self> {
+        if self.numbers.len() > NUMBERS_BESIDE_UP_MAX { self.first(NUMBERS_BESIDE_UP_MAX) } else { Some(self) }
+    }
+
+    fn similarity_of_equals(&self, other: &Self) -> Option<f64> {
         let dot = f64::from(dot(&self.numbers, &other.numbers));
         Some(match self.kind.metric {
             Metric::Cosine => (dot / (self.square * other.square).sqrt()).clamp(0.0, 1.0),

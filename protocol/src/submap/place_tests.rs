@@ -3,7 +3,7 @@ use super::super::{KeyframeError, Submap, SubmapBuilder, Summary, SummaryError};
 use super::*;
 use crate::config::SubmapConfig;
 use crate::geometry::Se3;
-use crate::submap::Looks;
+use crate::submap::{Looks, Up};
 use nalgebra::Vector3;
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
@@ -192,6 +192,33 @@ fn a_summary_with_a_place_survives_the_wire_and_is_no_longer_than_it_may_be() {
     let longest = room(1).summary.at(Some(place(Metric::Cosine, &vector(&mut rng, 256)))).encode();
     let longer = [longest, vec![0]].concat();
     assert_eq!(Summary::decode(&longer), Err(SummaryError::WrongLength { len: longer.len() }));
+}
+
+#[test]
+fn the_longest_place_leaves_room_for_what_is_up() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let up = Up::new([0.0, 1.0, 0.0], 0.02).unwrap();
+    for (numbers, kept) in [(252, 252), (253, 252), (256, 252), (4096, 252)] {
+        let (a, b) = (vector(&mut rng, numbers), vector(&mut rng, numbers));
+        let mixed: Vec<f32> = a.iter().zip(&b).map(|(a, b)| a + 0.3 * b).collect();
+        for metric in [Metric::Cosine, Metric::Euclidean] {
+            let at = |vector: &[f32]| room(1).summary.at(Some(place(metric, vector)));
+            let (whole, upright) = (at(&a), at(&mixed).upright(Some(up)));
+            let bytes = upright.encode();
+            assert_eq!(Summary::decode(&bytes).as_ref(), Ok(&upright));
+            let spare = crate::submap::SUMMARY_LEN_MAX - bytes.len();
+            assert_eq!(spare, NUMBERS_BESIDE_UP_MAX - kept, "{numbers}");
+            // The few numbers that are left out hardly matter, and both ways round alike.
+            let (found, back) = (whole.similarity_from(&upright, 0.0), upright.similarity_from(&whole, 0.0));
+            let exact = whole.similarity_from(&at(&mixed), 0.0).unwrap();
+            assert_eq!(found, back);
+            assert!(found.unwrap().by == Looks::Place && (found.unwrap().value - exact.value).abs() < 0.03);
+        }
+    }
+    // Places of the same kind, one of which is too short for anything to have been left out of it.
+    let mut cut = place(Metric::Cosine, &[1.0; 256]);
+    cut.numbers.truncate(251);
+    assert_eq!(cut.similarity(&place(Metric::Cosine, &[1.0; 256])), None);
 }
 
 proptest! {

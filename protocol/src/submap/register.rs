@@ -14,6 +14,7 @@
 
 use super::court::{Court, Judged};
 use super::features::{Features, Keypoints, in_voxels};
+use super::gravity::Verticals;
 use super::hypotheses::hypotheses;
 use super::matching::pair_up;
 use super::refine::{RefineConfig, RefineError, Refined, refine_anchored};
@@ -30,6 +31,9 @@ const LOG10: f64 = core::f64::consts::LOG10_E;
 
 /// Largest standard deviation of a rotation, rad: a covariance speaks of the neighbourhood in which rotations add up.
 const ROTATION_SIGMA_MAX: f64 = 0.25;
+/// Standard deviation of a pose's tilt, rad, before and after it is polished, beyond what the verticals err. Poses of few
+/// matches are often off by several degrees; a polished one hardly by one.
+const TILT_SIGMAS: [f64; 2] = [0.06, 0.02];
 /// Share of keypoints that may lie in one half-voxel cell with another: of a thinned cloud's hardly any do.
 const CROWDED_MAX: f64 = 0.1;
 
@@ -51,6 +55,8 @@ pub struct RegisterConfig {
     pub slid_max: f64,
     /// The refinement.
     pub refine: RefineConfig,
+    /// Which way is up, if both submaps know: poses that tilt one against the other are not looked at.
+    pub verticals: Option<Verticals>,
 }
 
 impl Default for RegisterConfig {
@@ -63,6 +69,7 @@ impl Default for RegisterConfig {
             rival_ratio: 0.8,
             slid_max: 0.6,
             refine: RefineConfig::default(),
+            verticals: None,
         }
     }
 }
@@ -98,6 +105,14 @@ pub enum RegisterError {
         fit: f64,
         /// Of the best one.
         contradiction: f64,
+    },
+    /// The pose tilts one submap's vertical against the other's.
+    #[error("the pose tilts by {tilt:.3} rad what both submaps know to be upright to within {tilt_max:.3}")]
+    Tilted {
+        /// By how much, rad.
+        tilt: f64,
+        /// What would have passed.
+        tilt_max: f64,
     },
     /// Two different poses are about equally good.
     #[error("two poses with scores {score:.0} and {rival:.0}: the place looks like another")]
@@ -155,9 +170,13 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
         let pose = found.t_target_source.sim().to_se3();
         poses.insert(0, Pose { rotation: pose.rotation.matrix(), translation: pose.translation / voxel });
     }
+    // The others still tell what chance does.
+    let upright = |pose: &Pose, sigma| config.verticals.is_none_or(|known| known.allow(&pose.rotation, sigma));
     let court = Court::new(&their_cloud, &my_cloud, &pairings.all, Scene::new(mine), &poses);
-    let judged = court.judge(&poses);
+    poses.retain(|pose| upright(pose, TILT_SIGMAS[0]));
     let count = poses.len();
+    let mut judged = court.judge(&poses);
+    judged.retain(|j| upright(&j.pose, TILT_SIGMAS[1]));
     let passes = |j: &&Judged| {
         j.score >= config.score_min && j.fit >= config.fit_min && j.contradiction() <= config.contradiction_max
     };
@@ -182,6 +201,12 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     let turn = refined.pose.covariance.matrix().fixed_view::<3, 3>(3, 3).symmetric_eigenvalues().max();
     if turn > ROTATION_SIGMA_MAX * ROTATION_SIGMA_MAX {
         return Err(RefineError::Degenerate { share: refined.share }.into());
+    }
+    if let Some(known) = &config.verticals {
+        let (tilt, tilt_max) = (known.tilt(&refined.pose.pose.rotation.matrix()), known.tilt_max(turn.sqrt()));
+        if tilt > tilt_max {
+            return Err(RegisterError::Tilted { tilt, tilt_max });
+        }
     }
     // Along a corridor all poses are nearly as good, and the matches that seem to hold this one were chosen to.
     if refined.share < config.refine.share_min {

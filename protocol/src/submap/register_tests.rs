@@ -1,7 +1,7 @@
 use super::super::Described;
 use super::super::testing::{config, moved_room, room, room_points, submap};
 use super::*;
-use crate::submap::describe;
+use crate::submap::{Up, describe};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -133,4 +133,62 @@ fn keypoints_on_one_spot_are_refused() {
     let answer = |share| register(&theirs(share), &mine.features, &settings());
     assert!(answer(0.05).is_ok());
     assert!(matches!(answer(0.15), Err(RegisterError::Crowded { .. })));
+}
+
+/// Their submap, with what is up in it and in mine, where mine is tilted by `tilt` against the truth.
+fn with_verticals(t_theirs_mine: &Se3, tilt: f64, sigma: f64) -> RegisterConfig {
+    let up = |direction: Vector3<f64>| Up::new(direction.into(), sigma).unwrap();
+    let theirs = up(t_theirs_mine.rotation * Vector3::z());
+    let mine = up(So3::exp(&Vector3::new(tilt, 0.0, 0.0)) * Vector3::z());
+    RegisterConfig { verticals: Some(Verticals { theirs, mine }), ..settings() }
+}
+
+#[test]
+fn a_pose_that_tilts_what_is_upright_is_refused() {
+    let (theirs, t_theirs_mine) = moved_room(6, Vector3::new(0.4, -0.3, 1.9), Vector3::new(0.3, 0.1, 0.05));
+    let mine = room(6);
+    let of = |tilt, sigma| register(&theirs.keypoints, &mine.features, &with_verticals(&t_theirs_mine, tilt, sigma));
+    let unaware = registered(&theirs, &mine).unwrap();
+    let found = of(0.0, 0.02).unwrap();
+    let off = found.refined.pose.pose.local(&unaware.refined.pose.pose);
+    assert!(off.norm() < 5e-3, "what is upright is found as before: {off}");
+    assert!(of(0.05, 0.02).is_ok(), "a little over the sum of the standard deviations");
+    // The one good pose tilts by 20 degrees, and is not even looked at.
+    let tilted = of(20_f64.to_radians(), 0.02).unwrap_err();
+    assert!(matches!(tilted, RegisterError::NoConsensus { .. }), "{tilted}");
+    assert!(of(20_f64.to_radians(), 0.1).is_ok(), "unless little is known");
+    // What polishing may correct, and what it may not.
+    let refused = of(0.15, 0.02).unwrap_err();
+    assert!(matches!(refused, RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. }), "{refused}");
+}
+
+/// A box of a room looks much the same turned on its side; whoever knows what is up is not in doubt.
+#[test]
+fn what_is_up_settles_which_way_a_cube_lies() {
+    let faces = |turn: So3, some: usize| {
+        let mut dice = ChaCha8Rng::seed_from_u64(some as u64);
+        // An L of bumps on each wall, the same on all that a quarter turn about the x axis leads to.
+        let mut points = Vec::new();
+        for quarter in 0..4 {
+            let roll = So3::exp(&Vector3::new(f64::from(quarter) * core::f64::consts::FRAC_PI_2, 0.0, 0.0));
+            for _ in 0..7000 {
+                let (x, y) = (dice.random_range(-2.0..2.0), dice.random_range(-1.5..1.5));
+                let bump = if x > 0.5 && y > 0.3 && x + y < 2.4 { 0.5 } else { 0.0 };
+                points.push(turn * (roll * Vector3::new(x, y, 1.5 - bump)));
+            }
+        }
+        for _ in 0..5000 {
+            let (y, z): (f64, f64) = (dice.random_range(-1.5..1.5), dice.random_range(-1.5..1.5));
+            points.push(turn * Vector3::new(2.0, y, z));
+        }
+        describe(&submap(&points), &config())
+    };
+    let turn = So3::exp(&Vector3::new(0.2, -0.1, 1.3));
+    let (theirs, mine) = (faces(turn, 1), faces(So3::identity(), 2));
+    let unaware = registered(&theirs, &mine).unwrap_err();
+    assert!(matches!(unaware, RegisterError::Ambiguous { .. }), "{unaware}");
+    let t_theirs_mine = Se3::new(turn, Vector3::zeros());
+    let aware = register(&theirs.keypoints, &mine.features, &with_verticals(&t_theirs_mine, 0.0, 0.02)).unwrap();
+    let off = aware.refined.pose.pose.local(&t_theirs_mine.inverse());
+    assert!(off.norm() < 0.05, "{off}");
 }

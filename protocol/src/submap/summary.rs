@@ -8,9 +8,10 @@
 //! words (signs of seven numbers, 0.84 and 0.34), of means, and of second moments.
 //!
 //! Behind it may follow the user's own descriptor of the [`place`]; where two summaries have one of the same kind, these
-//! are compared instead.
+//! are compared instead. Between the two may stand which way is up.
 
 use super::descriptor::{Code, Projection};
+use super::gravity::{self, Up};
 use super::place::{self, Place};
 use crate::config::Sensor;
 use thiserror::Error;
@@ -36,6 +37,8 @@ pub(super) const HEADER_LEN: usize = 6;
 const LEN: usize = HEADER_LEN + WORDS;
 /// Set in the version of a summary that a place follows.
 const WITH_PLACE: u8 = 0x80;
+/// Set in the version of a summary that tells which way is up.
+const WITH_UP: u8 = 0x40;
 /// Accepted voxel edges, frame units.
 const VOXEL_RANGE: core::ops::RangeInclusive<f32> = 1e-4..=1e3;
 /// Clouds thinned to voxels that differ by more than this factor are not compared, nor their summaries.
@@ -57,6 +60,8 @@ pub struct Summary {
     square: u32,
     /// What the user's own front end says of the place.
     place: Option<Place>,
+    /// Which way is up, as it travels.
+    up: Option<Up>,
 }
 
 /// How alike two submaps are, and what says so.
@@ -100,6 +105,9 @@ pub enum SummaryError {
     /// What follows is no place.
     #[error("the place at the end of a summary is not in canonical form; its writer is faulty")]
     Place,
+    /// What should tell which way is up does not.
+    #[error("the vertical in a summary is not in canonical form; its writer is faulty")]
+    Up,
 }
 
 impl Summary {
@@ -144,13 +152,25 @@ impl Summary {
     }
 
     fn new(version: u8, voxel: f32, words: [u8; WORDS]) -> Self {
-        Self { version, voxel, words, square: dot(&words, &words), place: None }
+        Self { version, voxel, words, square: dot(&words, &words), place: None, up: None }
     }
 
     /// The same, with what the user's own front end says of the place.
     #[must_use]
     pub(super) fn at(self, place: Option<Place>) -> Self {
         Self { place, ..self }
+    }
+
+    /// The same, with which way is up in the anchor frame. The longest places lose their last numbers for it.
+    #[must_use]
+    pub(super) fn upright(self, up: Option<Up>) -> Self {
+        let place = if up.is_some() { self.place.and_then(Place::beside_up) } else { self.place };
+        Self { place, up: up.map(|up| up.rounded()), ..self }
+    }
+
+    /// Which way is up in the anchor frame, if its owner knows.
+    pub fn up(&self) -> Option<&Up> {
+        self.up.as_ref()
     }
 
     /// How alike two submaps look: 0 (nothing in common, or thinned to different voxels) to 1 (equal). Symmetric. Real
@@ -198,10 +218,12 @@ impl Summary {
 
     /// The summary as bytes, at most [`SUMMARY_LEN_MAX`].
     pub fn encode(&self) -> Vec<u8> {
-        let mark = if self.place.is_some() { WITH_PLACE } else { 0 };
-        let mut bytes = vec![self.version | mark, NUMBERS as u8];
+        let with_place = if self.place.is_some() { WITH_PLACE } else { 0 };
+        let with_up = if self.up.is_some() { WITH_UP } else { 0 };
+        let mut bytes = vec![self.version | with_place | with_up, NUMBERS as u8];
         bytes.extend(self.voxel.to_le_bytes());
         bytes.extend(self.words);
+        bytes.extend(self.up.iter().flat_map(Up::encode));
         bytes.extend(self.place.iter().flat_map(Place::encode));
         bytes
     }
@@ -212,7 +234,8 @@ impl Summary {
     /// [`SummaryError`], naming the first check that failed.
     pub fn decode(bytes: &[u8]) -> Result<Self, SummaryError> {
         if let [version, numbers, ..] = *bytes
-            && (!matches!(version & !WITH_PLACE, VERSION | LANDMARKS | RANGES) || usize::from(numbers) != NUMBERS)
+            && (!matches!(version & !(WITH_PLACE | WITH_UP), VERSION | LANDMARKS | RANGES)
+                || usize::from(numbers) != NUMBERS)
         {
             return Err(SummaryError::UnknownLayout { version, numbers });
         }
@@ -222,17 +245,24 @@ impl Summary {
         let voxel = f32::from_le_bytes([v0, v1, v2, v3]);
         let (words, rest) = rest.split_first_chunk::<WORDS>().ok_or(wrong_length.clone())?;
         let words = *words;
+        let (up, rest, place_max) = match version & WITH_UP {
+            0 => (None, rest, place::LEN_MAX),
+            _ => {
+                let (up, rest) = rest.split_first_chunk::<{ gravity::LEN }>().ok_or(wrong_length.clone())?;
+                (Some(Up::decode(*up).ok_or(SummaryError::Up)?), rest, place::LEN_BESIDE_UP_MAX)
+            }
+        };
         let place = match version & WITH_PLACE {
             0 if rest.is_empty() => None,
             0 => return Err(wrong_length),
-            _ if rest.len() > place::LEN_MAX => return Err(wrong_length),
+            _ if rest.len() > place_max => return Err(wrong_length),
             _ => Some(Place::decode(rest).ok_or(SummaryError::Place)?),
         };
         let scaled = matches!(words.iter().fold(0, |most, &word| word.max(most)), 0 | 255);
         if !VOXEL_RANGE.contains(&voxel) || !scaled {
             return Err(SummaryError::NotCanonical);
         }
-        Ok(Self::new(version & !WITH_PLACE, voxel, words).at(place))
+        Ok(Self { place, up, ..Self::new(version & !(WITH_PLACE | WITH_UP), voxel, words) })
     }
 }
 

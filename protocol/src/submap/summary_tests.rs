@@ -60,6 +60,28 @@ fn each_kind_of_damage_is_named() {
     assert_eq!(Summary::decode(&longer), Err(SummaryError::WrongLength { len: LEN + 1 }));
 }
 
+#[test]
+fn which_way_is_up_survives_the_wire() {
+    let plain = room(1).summary;
+    assert_eq!((plain.up(), plain.encode().len()), (None, LEN));
+    let up = Up::new([0.6, 0.0, -0.8], 0.02).unwrap();
+    let upright = plain.clone().upright(Some(up));
+    let bytes = upright.encode();
+    assert_eq!((bytes.len(), Summary::decode(&bytes).as_ref()), (LEN + gravity::LEN, Ok(&upright)));
+    let told = *upright.up().unwrap();
+    assert!((told.direction() - up.direction()).norm() < 1e-4 && (0.02..0.0206).contains(&told.sigma()));
+    // It says nothing of what the submap looks like.
+    assert_eq!(upright.similarity(&plain), 1.0);
+    for len in LEN..bytes.len() {
+        assert_eq!(Summary::decode(&bytes[..len]), Err(SummaryError::WrongLength { len }));
+    }
+    let mut damaged = bytes.clone();
+    damaged[LEN..LEN + 2].copy_from_slice(&i16::MIN.to_le_bytes());
+    assert_eq!(Summary::decode(&damaged), Err(SummaryError::Up));
+    let longer = [bytes, vec![0]].concat();
+    assert_eq!(Summary::decode(&longer), Err(SummaryError::WrongLength { len: longer.len() }));
+}
+
 proptest! {
     #[test]
     fn any_bytes_are_refused_or_come_back_the_same(mut bytes in prop::collection::vec(any::<u8>(), 0..2 * LEN), fix in any::<bool>()) {
@@ -71,7 +93,12 @@ proptest! {
             prop_assert!(Summary::decode(&bytes).is_ok());
         }
         if let Ok(summary) = Summary::decode(&bytes) {
-            prop_assert_eq!(summary.encode(), bytes);
+            prop_assert_eq!(summary.encode(), bytes.clone());
+        }
+        if fix && bytes.len() == LEN {
+            bytes[0] |= WITH_UP;
+            bytes.extend([1, 2, 3, 4, 5]);
+            prop_assert_eq!(Summary::decode(&bytes).map(|summary| summary.encode()), Ok(bytes));
         }
     }
 }

@@ -43,6 +43,7 @@ pub fn keyframe(stamp: i64, pose: Se3, points: &[Vector3<f64>]) -> Keyframe {
         points: points.iter().map(|p| [p.x as f32, p.y as f32, p.z as f32]).collect(),
         marks: Vec::new(),
         place: None,
+        up: None,
     }
 }
 

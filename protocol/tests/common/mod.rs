@@ -125,6 +125,7 @@ pub fn drive(world: &World, k: usize, count: usize) -> (Vec<Keyframe>, Vec<Se3>)
             points: world.scan(&pose, 7 * n as u64 + 1000 * k as u64),
             marks: Vec::new(),
             place: None,
+            up: None,
         });
         truth.push(pose);
     }

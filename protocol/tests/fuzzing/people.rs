@@ -122,6 +122,7 @@ pub fn described() -> &'static (Vec<u8>, Vec<u8>) {
                 points,
                 marks: Vec::new(),
                 place: None,
+                up: None,
             })
             .unwrap();
         let described = submap::describe(&builder.flush().unwrap(), &config().submap);

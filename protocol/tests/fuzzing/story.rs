@@ -300,6 +300,7 @@ impl<'m, M: Meter> Story<'m, M> {
             points,
             marks: Vec::new(),
             place: place.flatten(),
+            up: None,
         };
         self.give(k, Input::Keyframe(keyframe));
     }

@@ -62,7 +62,7 @@ pub fn misfits(config: SubmapConfig, keyframes: Vec<(Se3, Vec<[f32; 3]>)>) -> Ve
 fn keyframe(k: usize, pose: Se3, points: Vec<[f32; 3]>) -> Keyframe {
     let pose = PoseWithCovariance { pose, covariance: Covariance::from_sigmas([0.01; 6]).unwrap() };
     let (stamp, covariance_of) = (Stamp(k as i64 + 1), CovarianceOf::Motion);
-    Keyframe { stamp, session: None, pose, covariance_of, points, marks: Vec::new(), place: None }
+    Keyframe { stamp, session: None, pose, covariance_of, points, marks: Vec::new(), place: None, up: None }
 }
 
 /// A submap of keyframes at believed poses; the anchor is truly where the keyframe is that it was placed at.

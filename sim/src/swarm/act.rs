@@ -196,7 +196,10 @@ impl<C: Core> Swarm<C> {
         }
         let seen = self.stopwatch.time("scan", || self.stage.scan(drive, index));
         let keyframe = match seen.and_then(|seen| one.slam.keyframe(step, seen)) {
-            Ok(keyframe) => Keyframe { place: self.stage.place(drive, index), ..keyframe },
+            Ok(keyframe) => {
+                let (place, up) = (self.stage.place(drive, index), self.stage.up(drive, index));
+                Keyframe { place, up, ..keyframe }
+            }
             Err(error) => return self.object("stage", error.to_string()),
         };
         one.keyframes += 1;

@@ -287,6 +287,7 @@ impl Slam {
             points,
             marks,
             place: None,
+            up: None,
         })
     }
 

@@ -134,6 +134,7 @@ mod tests {
             points,
             marks: vec![],
             place: None,
+            up: None,
         };
         builder.push(keyframe).unwrap();
         let job = Job::Describe(Box::new(DescribeJob { submap: builder.flush().unwrap(), config }));
@@ -157,6 +158,7 @@ mod tests {
             config: AlignConfig::default(),
             voxel_m: 0.1,
             sensor: Sensor::Points3d,
+            verticals: None,
             scale: ScaleKind::Metric,
             seed,
         };

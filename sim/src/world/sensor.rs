@@ -26,6 +26,9 @@ pub struct SensorOptions {
     pub range_sigma_m: f64,
     /// Share of rays that return nothing though something is there.
     pub dropout: f64,
+    /// Standard deviation of what an inertial sensor beside it takes for up, degrees; without it, there is none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gravity_sigma_deg: Option<f64>,
 }
 
 impl Default for SensorOptions {
@@ -37,6 +40,7 @@ impl Default for SensorOptions {
             range_m: [0.4, 20.0],
             range_sigma_m: 0.01,
             dropout: 0.02,
+            gravity_sigma_deg: None,
         }
     }
 }

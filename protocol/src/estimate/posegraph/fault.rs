@@ -120,7 +120,7 @@ impl PoseGraph {
             }
             SolveError::Underconstrained { variable } => self.undetermined(variable),
             SolveError::NotFinite => self.overflow(),
-            SolveError::Start { .. } | SolveError::OutOfMemory => None,
+            SolveError::Start { .. } | SolveError::TooDense { .. } | SolveError::OutOfMemory => None,
         };
         fault.unwrap_or(PoseGraphError::Solve(error))
     }

@@ -26,6 +26,7 @@ fn keyframe(stamp: i64, pose: Se3, points: Vec<[f32; 3]>, marks: Vec<Mark>) -> K
         points,
         marks,
         place: None,
+        up: None,
     }
 }
 

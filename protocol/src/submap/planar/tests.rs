@@ -69,6 +69,7 @@ fn keyframe(stamp: i64, pose: Se3, sigma: f64, points: Vec<[f32; 3]>) -> Keyfram
         points,
         marks: Vec::new(),
         place: None,
+        up: None,
     }
 }
 

@@ -87,6 +87,7 @@ fn of_robot(outcome: &Outcome<Agent>, robot: usize, config: &SubmapConfig) -> an
             points,
             marks,
             place: None,
+            up: None,
         };
         submaps.extend(builder.push(keyframe)?);
     }

@@ -6,7 +6,9 @@ use merganser_protocol::align::SolverConfig;
 use merganser_protocol::config::Sensor;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::submap::planar::{self, FlatConfig};
-use merganser_protocol::submap::{Features, RefineConfig, RegisterConfig, RegisterError, Registered, register};
+use merganser_protocol::submap::{
+    Features, RefineConfig, RegisterConfig, RegisterError, Registered, Verticals, register,
+};
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 
@@ -78,7 +80,8 @@ fn one(sets: &[Set], their: At, mine: At) -> anyhow::Result<Tried> {
     let sensor = sets[their.0].sensor;
     let radius = if sensor == Sensor::Laser2d { NEAR_PLANAR_M } else { near };
     let solver = SolverConfig { sigma_max: near, support_min: 8.0, seed: 7, ..Default::default() };
-    let config = RegisterConfig { solver, refine: RefineConfig::of(sensor), ..Default::default() };
+    let verticals = Verticals::of(theirs.described.summary.up(), ours.described.summary.up());
+    let config = RegisterConfig { solver, refine: RefineConfig::of(sensor), verticals, ..Default::default() };
     let start = thread_seconds();
     let keypoints = &theirs.described.keypoints;
     let answer = if sensor == Sensor::Laser2d {

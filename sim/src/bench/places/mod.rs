@@ -13,6 +13,7 @@ mod table;
 
 use crate::bar::progress_bar;
 use clap::Args;
+use merganser_protocol::config::UP_SIGMA_RANGE_RAD;
 use std::io::Write;
 use std::path::PathBuf;
 
@@ -31,12 +32,21 @@ pub struct Places {
     /// Runs, each with the next seed
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100))]
     pub runs: u64,
+    /// Tell each submap which way is up, with a draw of this standard deviation, rad, about each horizontal axis. What is up in
+    /// the depth camera's world is taken from its walls and floor
+    #[arg(long, value_name = "RAD", value_parser = sigma_rad)]
+    pub gravity: Option<f64>,
     /// Measure KISS-Matcher on the same LiDAR pairs, in this Python interpreter
     #[arg(long, value_name = "PYTHON")]
     pub peer_python: Option<PathBuf>,
     /// KISS-Matcher's voxel, m; its own default is 0.3
     #[arg(long, default_value_t = 0.3)]
     pub peer_voxel: f64,
+}
+
+fn sigma_rad(text: &str) -> Result<f64, String> {
+    let sigma: f64 = text.parse().map_err(|error: core::num::ParseFloatError| error.to_string())?;
+    if UP_SIGMA_RANGE_RAD.contains(&sigma) { Ok(sigma) } else { Err("use 0.001 to 0.5".into()) }
 }
 
 /// Measures and prints. Returns whether as much was found as promised, and no more wrong accepted (nothing, but of the
@@ -47,7 +57,7 @@ pub struct Places {
 pub fn run(options: &Places) -> anyhow::Result<bool> {
     let mut good = true;
     for seed in options.seed..options.seed + options.runs {
-        let sets = sets::load(&options.data, usize::from(options.keypoints), seed)?;
+        let sets = sets::load(&options.data, usize::from(options.keypoints), options.gravity, seed)?;
         let bar = progress_bar(measure::pairs(&sets).len() as u64, "pairs")?;
         let tried = measure::all(&sets, || bar.inc(1))?;
         bar.finish_and_clear();
