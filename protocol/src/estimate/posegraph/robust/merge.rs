@@ -69,7 +69,7 @@ impl World<'_> {
         let between: Vec<Between> = chosen.iter().map(turned).collect();
         let distances = Distances::new(a, b, &between)?;
         let everyone: Set = (0..kept).map(bit).sum();
-        let volume = a.extent.max(b.extent) * self.rotations;
+        let volume = a.volume.max(b.volume);
         let mut best: Option<(Surest, u32)> = None;
         let scales = scales_to(self.config.covariance_scale_max.max(1.0));
         let widest = distances.graph(scales.into_iter().fold(1.0, f64::max));

@@ -25,6 +25,7 @@ mod world;
 use super::{Measurement, PoseGraph, covariance_of};
 use crate::config::EstimateConfig;
 use crate::estimate::Unused;
+use crate::estimate::frames::scales_to;
 use crate::estimate::graph::{Factor, Label};
 use crate::estimate::solve::Solution;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
@@ -140,7 +141,9 @@ impl PoseGraph {
             config,
             trusted: BTreeMap::new(),
             nodes: BTreeMap::new(),
+            spread: world::spread(&closures),
             rotations: world::rotations(&closures),
+            scales: vec![1.0],
             closures,
             start: BTreeMap::new(),
             parts: Vec::new(),
@@ -201,16 +204,31 @@ impl PoseGraph {
         }
         self.lay_out(world, &seed);
         let mut is_crowded = false;
+        // What counted when all closures last showed more noise than was believed, and whether it did before.
+        let mut raised: (Vec<usize>, bool) = (Vec::new(), false);
         for _ in 0..REVISIONS_MAX {
             world.settle();
-            let told = match world.scale() {
+            let shown = world.scale();
+            if let Scale::Clear(_) = shown
+                && !is_crowded
+            {
+                world.scales = scales_to(world.config.covariance_scale_max.max(1.0)).to_vec();
+            }
+            let told = match shown {
                 _ if is_crowded => noise,
                 Scale::Crowded => {
                     // What was let in at another noise is judged again.
                     is_crowded = true;
+                    world.scales = vec![1.0];
                     Noise::stated()
                 }
-                Scale::Clear(scale) if scale > SCALE_BEYOND => noise.scaled(scale),
+                Scale::Clear(scale) if scale > SCALE_BEYOND => {
+                    let used = world.used();
+                    raised = (used.clone(), used == raised.0);
+                    noise.scaled(scale)
+                }
+                // What counts shows too little, over and over, for lack of the others.
+                Scale::Clear(_) if raised.1 && raised.0 == world.used() => noise,
                 Scale::Clear(_) => world.noise(&noise),
             };
             if !told.is_near(&noise, NOISE_SHARE) {

@@ -55,6 +55,18 @@ pub(super) fn log_ratio((d2, log_sqrt_det): Innovation, volume: f64, s: f64) -> 
     log(volume) - 0.5 * d2 / (s * s) - 6.0 * log(s) - log_sqrt_det - 3.0 * log(2.0 * PI)
 }
 
+/// The same, of a scale that is only known to be one of some: averaged over them.
+pub(super) fn log_ratio_over(innovation: Innovation, volume: f64, scales: &[f64]) -> f64 {
+    let ratios = scales.iter().map(|&s| log_ratio(innovation, volume, s));
+    let most = ratios.clone().fold(f64::NEG_INFINITY, f64::max);
+    if most.is_finite() { most + log(ratios.map(|r| exp(r - most)).sum::<f64>() / scales.len() as f64) } else { most }
+}
+
+/// ln of the probability that chance brings a false closure as near to the map.
+pub(super) fn log_chance((d2, log_sqrt_det): Innovation, volume: f64) -> f64 {
+    (3.0 * log(PI * d2) - log(6.0) + log_sqrt_det - log(volume)).min(0.0)
+}
+
 fn log_likelihood(innovations: &[Innovation], volume: f64, s: f64) -> f64 {
     let ratios: Vec<f64> = innovations.iter().map(|&x| log_ratio(x, volume, s)).collect();
     let n = ratios.len() as f64;
@@ -89,6 +101,27 @@ mod tests {
             assert!((found / s).ln().abs() < 0.25, "{found} for {s}");
         }
         assert_eq!(Scale::of(&noise(4, 3, 5.0), 1e6), Scale::Clear(1.0));
+    }
+
+    #[test]
+    fn a_scale_that_is_not_known_tells_near_ones_less_and_far_ones_more() {
+        let volume = 1e4;
+        let at = |d2: f64| (log_ratio((d2, -9.0), volume, 1.0), log_ratio_over((d2, -9.0), volume, &[1.0, 1.7, 3.0]));
+        assert_eq!(log_ratio_over((6.0, -9.0), volume, &[1.0]), log_ratio((6.0, -9.0), volume, 1.0));
+        let ((sure, unsure), (far, explained)) = (at(6.0), at(60.0));
+        assert!(unsure < sure && unsure > sure - log(3.0) - 1e-9, "{unsure} {sure}");
+        assert!(explained > far + 10.0, "{explained} {far}");
+    }
+
+    #[test]
+    fn chance_is_the_share_of_the_volume_that_is_as_near() {
+        let mut rng = rng(7);
+        let (edge, n) = (4.0, 200_000);
+        let d2 = |rng: &mut _| (0..6).map(|_| uniform(rng, -0.5 * edge, 0.5 * edge).powi(2)).sum::<f64>();
+        let near = (0..n).filter(|_| d2(&mut rng) <= 3.0).count();
+        let told = exp(log_chance((3.0, 0.0), libm::pow(edge, 6.0)));
+        assert!((near as f64 / f64::from(n) / told - 1.0).abs() < 0.05, "{near} {told}");
+        assert_eq!(log_chance((1e9, 0.0), 1.0), 0.0, "never more than certain");
     }
 
     #[test]

@@ -160,6 +160,55 @@ fn closures_with_robots_that_are_merged_count_together() {
     assert!(truths.iter().all(is_used) && !lies.iter().any(is_used), "{truths:?} {lies:?}");
 }
 
+/// Odometry may drift by more than it says between two places where robots meet: closures at the second that agree
+/// with each other count, though each contradicts what drift was believed.
+#[test]
+fn closures_that_agree_with_each_other_outweigh_the_drift_between() {
+    for seed in 0..6 {
+        let mut graph = walk(seed, 10);
+        let odometry = 2 * (POSES as usize - 1);
+        let truth = walk_truth(&graph, odometry);
+        let sample = graph.measurements[odometry].clone();
+        graph.measurements.truncate(odometry);
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+        let mut draw = |size: f64| Vector3::from_fn(|_, _| 3.0_f64.sqrt() * rng.random_range(-size..size));
+        let first = (0..8).flat_map(|a| (0..8).map(move |b| (a, b)));
+        for (a, b) in first.chain((0..4).map(|k| (20 + k, 23 - k))) {
+            let t_i_j = truth[&id(b'a', a)].inverse() * truth[&id(b'b', b)];
+            let t_i_j = t_i_j.retract(&se3::join(&draw(SIGMA.0), &draw(SIGMA.1)));
+            graph.measurements.push(Measurement { i: id(b'a', a), j: id(b'b', b), t_i_j, ..sample.clone() });
+        }
+        // Between the two places, robot b slips.
+        let step = graph.measurements.iter_mut().find(|m| (m.i, m.j) == (id(b'b', 12), id(b'b', 13))).unwrap();
+        step.t_i_j = step.t_i_j.retract(&Vector6::new(0.65, 0.65, 0.65, 0.0, 0.0, 0.0));
+        let solved = graph.solve_robustly(&EstimateConfig::default());
+        let left_out = solved.verdicts[odometry..].iter().filter(|v| !is_used(v));
+        assert_eq!(left_out.clone().count(), 0, "seed {seed}: {:?}", left_out.collect::<Vec<_>>());
+    }
+}
+
+/// False closures may fall anywhere that closures lie, but a few far out do not tell where.
+#[test]
+fn the_spread_of_closures_is_that_of_the_many() {
+    let rng = &mut ChaCha8Rng::seed_from_u64(3);
+    let frame = |robot: u8| crate::ids::FrameId { robot: crate::ids::RobotId([robot; 8]), epoch: 0 };
+    let anchor = |robot: u8| crate::ids::SubmapId { frame: frame(robot), index: 0 };
+    let covariance = covariance_of(&isotropic_information(1.0, 1.0)).unwrap();
+    let mut closure = |k: usize, size: f64| {
+        let place = Vector3::from_fn(|_, _| rng.random_range(-size..size));
+        let t = crate::geometry::PoseWithCovariance { pose: Se3::new(So3::identity(), place), covariance };
+        super::Closure { k, i: anchor(1), j: anchor(2), stated: t, t_i_j: t, unused: None, drops: 0 }
+    };
+    let mut closures: Vec<_> = (0..500).map(|k| closure(k, 10.0)).collect();
+    let told = super::world::spread(&closures);
+    // Never much more; a box that happens to hold a few tells less.
+    assert!((0.3..1.1).contains(&(told / 8000.0)), "{told}");
+    closures.extend((500..540).map(|k| closure(k, 1e5)));
+    let with_few_far = super::world::spread(&closures);
+    assert!(with_few_far < 2.0 * told, "{with_few_far} {told}");
+    assert_eq!(super::world::spread(&[]), 0.0);
+}
+
 /// A robot whose poses are numbered along rows of a grid: its own measurements hold them together, not their order.
 #[test]
 fn poses_in_no_order_of_time_are_one_frame() {

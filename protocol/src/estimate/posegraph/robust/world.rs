@@ -26,13 +26,19 @@ pub(super) const CHI2_MAX: [f64; 6] =
 /// ln of how much likelier than by chance a closure must be there to be let in by itself.
 const LOG_ODDS_MIN: f64 = 2.3;
 /// Closures tried at once in a part whose map is too unsure to tell them.
-const TRIALS_MAX: usize = 16;
+const TRIALS_MAX: usize = 24;
+/// Expected number of false closures, of all that wait, that are let in by themselves.
+const FALSE_ALARMS_MAX: f64 = 0.01;
+/// Of times [`CHI2_MAX`] beyond which nothing is asked of a closure.
+const FAR: f64 = 4.0;
 /// χ²₆ at 99.99 %.
 const CHI2_9999: f64 = 27.856_341_235_954_06;
 /// Least edge of the box in which a false closure may fall, m.
 const SEARCH_EDGE_MIN: f64 = 2.0;
 /// A closure dropped so often stays out.
 const DROPS_MAX: u8 = 2;
+/// Halvings of the interval in which a limit lies.
+const LIMIT_STEPS: usize = 30;
 /// Rounds of dropping and admitting in one settlement.
 const ROUNDS_MAX: usize = 64;
 
@@ -44,8 +50,8 @@ pub(super) struct Part {
     pub(super) solution: Solution,
     /// Covariance of each anchor's perturbation, the first held fixed.
     marginals: Vec<Matrix6<f64>>,
-    /// Volume of the box around its anchors.
-    pub(super) extent: f64,
+    /// Volume, of places times rotations, over which a false closure may fall.
+    pub(super) volume: f64,
 }
 
 /// Everything that is known, and what counts of it.
@@ -57,8 +63,11 @@ pub(super) struct World<'a> {
     pub(super) closures: Vec<Closure>,
     pub(super) start: BTreeMap<SubmapId, Sim3>,
     pub(super) parts: Vec<Part>,
-    /// Volume of the rotations by which a false closure may be turned.
+    /// Volume of places and of rotations over which false closures spread, whatever map they meet.
+    pub(super) spread: f64,
     pub(super) rotations: f64,
+    /// Factors by which standard deviations may be larger than the noise that is believed.
+    pub(super) scales: Vec<f64>,
 }
 
 impl World<'_> {
@@ -125,7 +134,8 @@ impl World<'_> {
         let inverse = solution.selected_inverse();
         let of_anchor = |k| solution.covariance_along(&inverse, 0, k).map(|m| m.fixed_view::<6, 6>(0, 0).into_owned());
         let marginals = (0..solution.graph().nodes().len()).filter_map(of_anchor).collect();
-        Ok(Part { frames, used, marginals, extent: extent(solution.values()), solution })
+        let volume = extent(solution.values()).max(self.spread) * self.rotations;
+        Ok(Part { frames, used, marginals, volume, solution })
     }
 
     /// Drops the closures that the rest contradicts, of each pair of frames the worst; whether there are any.
@@ -160,6 +170,7 @@ impl World<'_> {
     /// Lets in the closures that agree with the map; whether there are any.
     fn admit(&mut self) -> bool {
         let mut any = false;
+        let waiting = self.waiting();
         for k in 0..self.closures.len() {
             let c = &self.closures[k];
             if c.is_used() || c.drops >= DROPS_MAX {
@@ -169,10 +180,10 @@ impl World<'_> {
             if !part.frames.contains(&c.j.frame) {
                 continue;
             }
-            if let Some((chi2, log_sqrt_det)) = self.innovation(part, c) {
+            if let Some(x) = self.innovation(part, c) {
+                let (chi2, _) = x;
                 let own = c.i.frame == c.j.frame;
-                let told = scale::log_ratio((chi2, log_sqrt_det), part.extent * self.rotations, 1.0) > LOG_ODDS_MIN;
-                if chi2 <= CHI2_MAX[5] && (own || told) {
+                if chi2 <= CHI2_MAX[5] && (own || self.is_told(part, x, waiting)) {
                     self.closures[k].unused = None;
                     any = true;
                 } else {
@@ -187,39 +198,45 @@ impl World<'_> {
     /// chance; whether there are any.
     ///
     /// Each is tried in turn: those that then agree are told from chance by it. The trial with the most evidence in all
-    /// counts.
+    /// counts. The first may be further off than the noise that is believed explains: odometry drifts more over long ways
+    /// than from step to step, and closures far from all others are the first to show it. It then needs as many with it
+    /// as two frames do to merge.
     pub(super) fn admit_together(&mut self) -> bool {
         let mut any = false;
+        let widest = self.scales.iter().fold(1.0, |x: f64, s| x.max(s * s)).min(FAR);
         for k in 0..self.parts.len() {
             let part = &self.parts[k];
-            let volume = part.extent * self.rotations;
             let inside = |c: &Closure| part.frames.contains(&c.i.frame) && part.frames.contains(&c.j.frame);
-            let mut waiting: Vec<(f64, usize)> = Vec::new();
+            let mut waiting: Vec<(f64, f64, usize)> = Vec::new();
             for (at, c) in self.closures.iter().enumerate().filter(|(_, c)| c.is_candidate() && inside(c)) {
-                if let Some(x) = self.innovation(part, c).filter(|(chi2, _)| *chi2 <= CHI2_MAX[5]) {
-                    waiting.push((scale::log_ratio(x, volume, 1.0), at));
+                if let Some(x) = self.innovation(part, c).filter(|(chi2, _)| *chi2 <= CHI2_MAX[5] * widest) {
+                    waiting.push((scale::log_ratio_over(x, part.volume, &self.scales), x.0, at));
                 }
             }
             if waiting.len() < 2 {
                 continue;
             }
-            waiting.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));
+            waiting.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.2.cmp(&y.2)));
             let mut best: (f64, Vec<usize>) = (LOG_ODDS_MIN + libm::log(1e4 * waiting.len() as f64), Vec::new());
-            for &(own, at) in waiting.iter().take(TRIALS_MAX) {
+            for &(own, chi2, at) in waiting.iter().take(TRIALS_MAX) {
+                // Those that one of them brings in would each bring in the others.
+                if best.1.contains(&at) {
+                    continue;
+                }
                 let mut used = part.used.clone();
                 used.push(at);
                 used.sort_unstable();
                 let Ok(trial) = self.solved(part.frames.clone(), used) else { continue };
                 let (mut evidence, mut together) = (own, vec![at]);
-                for &(_, other) in waiting.iter().filter(|w| w.1 != at) {
+                for &(_, _, other) in waiting.iter().filter(|w| w.2 != at) {
                     let told = self.innovation(&trial, &self.closures[other]).filter(|(chi2, _)| *chi2 <= CHI2_MAX[5]);
-                    let ratio = told.map_or(f64::NEG_INFINITY, |x| scale::log_ratio(x, volume, 1.0));
-                    if ratio > LOG_ODDS_MIN {
-                        evidence += ratio;
+                    if let Some(x) = told.filter(|&x| self.is_told(&trial, x, waiting.len())) {
+                        evidence += scale::log_ratio_over(x, trial.volume, &self.scales);
                         together.push(other);
                     }
                 }
-                if together.len() >= 2 && evidence > best.0 {
+                let least = if chi2 <= CHI2_MAX[5] { 2 } else { self.config.alignments_min.max(2) };
+                if together.len() >= least && evidence > best.0 {
                     best = (evidence, together);
                 }
             }
@@ -229,6 +246,24 @@ impl World<'_> {
             }
         }
         any
+    }
+
+    /// Whether a closure is told from chance, of so many that wait: by its odds, and by how few false ones would come
+    /// as near.
+    fn is_told(&self, part: &Part, x: Innovation, waiting: usize) -> bool {
+        let false_alarms = libm::log(waiting.max(1) as f64) + scale::log_chance(x, part.volume);
+        scale::log_ratio_over(x, part.volume, &self.scales) > LOG_ODDS_MIN
+            && false_alarms <= libm::log(FALSE_ALARMS_MAX)
+    }
+
+    /// Closures that count.
+    pub(super) fn used(&self) -> Vec<usize> {
+        self.closures.iter().filter(|c| c.is_used()).map(|c| c.k).collect()
+    }
+
+    /// Closures between frames that do not count.
+    fn waiting(&self) -> usize {
+        self.closures.iter().filter(|c| !c.is_used() && c.i.frame != c.j.frame).count()
     }
 
     /// How far a closure that does not count is from what a part says of its ends; `None` if it does not hold both.
@@ -242,7 +277,7 @@ impl World<'_> {
         let bound = (of_b + adjoint * of_a * adjoint.transpose()) * 2.0 + c.t_i_j.covariance.matrix() * 2.0;
         let off = predicted.local(&c.t_i_j.pose);
         let least = bound.cholesky().map_or(f64::INFINITY, |l| l.solve(&off).dot(&off));
-        if least > 4.0 * CHI2_MAX[5] {
+        if least > FAR * CHI2_MAX[5] {
             return Some((least, 0.0));
         }
         let Relative::Metric(predicted) = part.solution.relative(c.i, c.j, &BTreeSet::new())? else { return None };
@@ -260,7 +295,7 @@ impl World<'_> {
             .collect();
         let mut volume = 0.0;
         for part in &self.parts {
-            volume = f64::max(volume, part.extent * self.rotations);
+            volume = f64::max(volume, part.volume);
             let inverse = part.solution.selected_inverse();
             for edge in part.solution.graph().edges().iter().filter(|e| e.factor.label != Label::Odometry) {
                 let judged = leave_one_out(&part.solution, &inverse, edge).filter(|out| out.dof == 6);
@@ -271,10 +306,18 @@ impl World<'_> {
     }
 
     /// The χ² beyond which a closure between frames contradicts the map: where chance would bring it there as likely
-    /// as noise, but not where true ones are seldom, nor short of where most of them are.
+    /// as noise of one of the scales, but not where true ones are seldom, nor short of where most of them are.
     fn limit(&self, part: &Part, log_sqrt_det: f64) -> f64 {
-        let volume = part.extent * self.rotations;
-        (2.0 * scale::log_ratio((0.0, log_sqrt_det), volume, 1.0)).clamp(CHI2_9999, CHI2_MAX[5])
+        let odds = |chi2: f64| scale::log_ratio_over((chi2, log_sqrt_det), part.volume, &self.scales);
+        let (mut low, mut high) = (CHI2_9999, CHI2_MAX[5]);
+        if odds(high) >= 0.0 {
+            return high;
+        }
+        for _ in 0..LIMIT_STEPS {
+            let middle = 0.5 * (low + high);
+            *(if odds(middle) >= 0.0 { &mut low } else { &mut high }) = middle;
+        }
+        low
     }
 
     pub(super) fn part_of(&self, frame: FrameId) -> Option<&Part> {
@@ -307,6 +350,25 @@ fn extent(values: &[Sim3]) -> f64 {
     let low = places().fold(Vector3::repeat(f64::INFINITY), |x, y| x.inf(&y));
     let high = places().fold(Vector3::repeat(f64::NEG_INFINITY), |x, y| x.sup(&y));
     (high - low).map(|edge| edge.max(SEARCH_EDGE_MIN)).product()
+}
+
+/// Volume of places over which false closures spread, for one of them to fall anywhere in it as likely as in the densest
+/// box about the place where its ends would coincide: so few that lie far out make it no larger.
+pub(super) fn spread(closures: &[Closure]) -> f64 {
+    let places: Vec<Vector3<f64>> =
+        closures.iter().filter(|c| c.i.frame != c.j.frame).map(|c| c.t_i_j.pose.translation.abs()).collect();
+    let mut sorted: [Vec<f64>; 3] = core::array::from_fn(|k| places.iter().map(|p| p[k]).collect());
+    sorted.iter_mut().for_each(|axis| axis.sort_by(f64::total_cmp));
+    let mut least = f64::INFINITY;
+    for tenth in 1..=10 {
+        let Some(at) = (places.len() * tenth).div_ceil(10).checked_sub(1) else { return 0.0 };
+        let half = Vector3::from_fn(|k, _| sorted[k][at].max(0.5 * SEARCH_EDGE_MIN));
+        let inside = places.iter().filter(|p| (0..3).all(|k| p[k] <= half[k])).count();
+        if inside > 0 {
+            least = least.min(8.0 * half.product() * places.len() as f64 / inside as f64);
+        }
+    }
+    least
 }
 
 /// Volume of rotations over which false closures spread: about the vertical all, and tilts as large as those of the
