@@ -35,6 +35,11 @@ struct Merge {
 impl World<'_> {
     /// Merges what can be told; whether anything was.
     pub(super) fn merge(&mut self) -> bool {
+        self.merge_on(self.config.alignments_min, self.config.log10_nfa_max)
+    }
+
+    /// Merges on so many closures or more, and as few false alarms; whether anything was.
+    pub(super) fn merge_on(&mut self, closures_min: usize, log10_nfa_max: f64) -> bool {
         let mut tied: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
         for (k, c) in self.closures.iter().enumerate().filter(|(_, c)| c.is_candidate()) {
             let of = |id: SubmapId| self.parts.iter().position(|p| p.frames.contains(&id.frame));
@@ -45,6 +50,7 @@ impl World<'_> {
             }
         }
         let mut merges: Vec<Merge> = tied.iter().filter_map(|(&parts, list)| self.consider(parts, list)).collect();
+        merges.retain(|m| m.used.len() >= closures_min && m.log10_nfa <= log10_nfa_max);
         merges.sort_by(|x, y| x.log10_nfa.total_cmp(&y.log10_nfa).then(x.parts.cmp(&y.parts)));
         let mut sets = Disjoint::new(self.parts.len());
         merges.retain(|m| sets.join(m.parts.0, m.parts.1));
@@ -88,10 +94,7 @@ impl World<'_> {
         }
         let (Surest { set, hub, log10_nfa }, rivals) = best?;
         let members = set.count_ones();
-        if (members as usize) < self.config.alignments_min
-            || f64::from(rivals) >= RIVAL_SHARE * f64::from(members)
-            || log10_nfa > self.config.log10_nfa_max
-        {
+        if f64::from(rivals) >= RIVAL_SHARE * f64::from(members) {
             return None;
         }
         let (i, j, t) = &between[hub];

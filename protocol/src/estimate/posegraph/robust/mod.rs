@@ -8,12 +8,13 @@
 //! 2. Pairs of robots go through the consensus of a swarm's frames (`seed`).
 //! 3. Closures that the map contradicts are dropped and those that agree with it are let in, whoever left them out,
 //!    judged with the map's covariance (`world`); what now counts tells the noise better, and more may agree.
-//! 4. Parts of the map that few closures tie are merged where those agree through them (`merge`), and all begins
-//!    again at 3 until nothing changes.
+//! 4. Parts of the map that few closures tie are merged where those agree through them (`merge`), several together where
+//!    no two can be told (`cluster`), and all begins again at 3 until nothing changes.
 //!
 //! The map is then solved from the closures that count, with the information that the graph states.
 
 mod backbone;
+mod cluster;
 mod merge;
 mod noise;
 mod scale;
@@ -111,6 +112,7 @@ pub struct Fit {
 }
 
 /// A measurement that is not trusted.
+#[derive(Clone)]
 struct Closure {
     /// Its place in the graph.
     k: usize,
@@ -234,7 +236,8 @@ impl PoseGraph {
             if !told.is_near(&noise, NOISE_SHARE) {
                 noise = told;
                 self.believe(world, backbone, &noise);
-            } else if !world.admit_together() && !world.merge() {
+            } else if !world.admit_together() && !world.merge() && (is_crowded || !world.merge_together()) {
+                // Cuts of few closures say nothing where false ones agree with each other.
                 break;
             }
         }

@@ -160,6 +160,55 @@ fn closures_with_robots_that_are_merged_count_together() {
     assert!(truths.iter().all(is_used) && !lies.iter().any(is_used), "{truths:?} {lies:?}");
 }
 
+/// `robots` of which each stays in sight of the next, the last of the first: two true closures and two lies of each pair.
+fn ring(robots: u8, pairs: u8) -> (PoseGraph, usize) {
+    let walked = walk(7, 10);
+    let odometry = 2 * (POSES as usize - 1);
+    let truth = walk_truth(&walked, odometry);
+    let sample = walked.measurements[0].clone();
+    let mut graph = PoseGraph::default();
+    let place = |r: u8, k: u64| {
+        truth[&id(b'a', k)] * Se3::exp(&Vector6::new(0.4, f64::from(r), 0.2, 0.0, 0.1, 0.9 * f64::from(r)))
+    };
+    let mut add = |i: u64, j: u64, t_i_j: Se3| graph.measurements.push(Measurement { i, j, t_i_j, ..sample.clone() });
+    for r in 0..robots {
+        for k in 1..POSES {
+            add(id(b'a' + r, k - 1), id(b'a' + r, k), place(r, k - 1).inverse() * place(r, k));
+        }
+    }
+    for r in 0..pairs {
+        let s = (r + 1) % robots;
+        for (k, with) in [(3, 2), (19, 20)] {
+            add(id(b'a' + r, k), id(b'a' + s, with), place(r, k).inverse() * place(s, with));
+            let lie =
+                Se3::exp(&Vector6::new(3.0 - 0.4 * k as f64, 1.5, 0.5 * f64::from(r), 0.1, 0.0, 1.0 + f64::from(r)));
+            add(id(b'a' + r, k + 2), id(b'a' + s, with), place(r, k + 2).inverse() * place(s, with) * lie);
+        }
+    }
+    graph.poses = (0..robots).flat_map(|r| (0..POSES).map(move |k| (id(b'a' + r, k), None))).collect();
+    (graph, usize::from(robots) * (POSES as usize - 1))
+}
+
+/// No pair of four robots has the three closures that a merge asks, but every way to divide them cuts four.
+#[test]
+fn robots_that_no_pair_can_tell_merge_together() {
+    let (graph, odometry) = ring(4, 4);
+    let solved = graph.solve_robustly(&EstimateConfig::default());
+    assert_eq!(solved.components.len(), 1, "{:?}", &solved.verdicts[odometry..]);
+    for (k, verdict) in solved.verdicts[odometry..].iter().enumerate() {
+        assert_eq!(is_used(verdict), k % 2 == 0, "{k}: {verdict:?}");
+    }
+}
+
+/// In a row, two closures are all that holds each to the rest: too few.
+#[test]
+fn two_closures_across_a_cut_merge_nothing() {
+    let (graph, odometry) = ring(4, 3);
+    let solved = graph.solve_robustly(&EstimateConfig::default());
+    assert_eq!(solved.components.len(), 4);
+    assert!(!solved.verdicts[odometry..].iter().any(is_used));
+}
+
 /// Odometry may drift by more than it says between two places where robots meet: closures at the second that agree
 /// with each other count, though each contradicts what drift was believed.
 #[test]

@@ -43,6 +43,7 @@ const LIMIT_STEPS: usize = 30;
 const ROUNDS_MAX: usize = 64;
 
 /// Connected frames, solved together.
+#[derive(Clone)]
 pub(super) struct Part {
     pub(super) frames: BTreeSet<FrameId>,
     /// Closures that it counts.
@@ -55,6 +56,7 @@ pub(super) struct Part {
 }
 
 /// Everything that is known, and what counts of it.
+#[derive(Clone)]
 pub(super) struct World<'a> {
     pub(super) config: &'a EstimateConfig,
     /// Trusted factors by frame.
