@@ -26,7 +26,7 @@ fn keyframe(secs: u32, x: f64) -> Keyframe {
     let points = (0..400).map(|k| [(k % 20) as f32 * 0.3, (k / 20) as f32 * 0.3 - 3.0, 1.0 + (k % 7) as f32 * 0.1]);
     let (stamp, covariance_of) = (Stamp(i64::from(secs) * 1_000_000_000), CovarianceOf::Motion);
     let points = points.collect();
-    Keyframe { stamp, session: None, pose, covariance_of, points, marks: vec![], place: None }
+    Keyframe { stamp, session: None, pose, covariance_of, points, marks: vec![], place: None, up: None }
 }
 
 /// A drive from the frame's origin: keyframe by keyframe, from that second on.

@@ -82,7 +82,7 @@ pub(super) fn load(data: &Path, keypoints: usize, gravity: Option<f64>, seed: u6
 pub(super) fn dense(data: &Path, keypoints: usize, seed: u64) -> anyhow::Result<Place> {
     let mut maker = Maker { keypoints, gravity: None, rng: ChaCha8Rng::seed_from_u64(seed) };
     let points = files::points(&data.join("kitti00_scans/000000.bin"), 4)?;
-    Ok(maker.place("dense".to_owned(), DENSE_VOXEL_M, vec![(Se3::identity(), points)], &Vector3::z())?.0)
+    Ok(maker.place("dense".to_owned(), DENSE_VOXEL_M, &Vector3::z(), vec![(Se3::identity(), points)])?.0)
 }
 
 struct Maker {
