@@ -4,7 +4,7 @@ use super::condensing::{GONE_IN_A_ROW_MAX, Shorter, shorten};
 use super::knowledge::{Knowledge, Known};
 use crate::config::EstimateConfig;
 use crate::estimate::test_graphs::rng;
-use crate::estimate::test_world::World;
+use crate::estimate::test_world::{ODOMETRY, World};
 use crate::estimate::{JointEstimate, MapProblem, solve_map};
 use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::{EntryId, FrameId, Hash, SubmapId};
@@ -202,12 +202,12 @@ fn the_estimate_of_a_condensed_log_is_honest() {
     }
     // Compounding itself is exact (the next test). Here the odometry is linearised where it was measured, and in the whole
     // graph where the loops move it to: by so much the two differ, to either side.
-    assert!(ratios[0] > 0.995 && least > 0.98, "surer than before: {}, {least}", ratios[0]);
+    assert!(ratios[0] > 0.999 && least > 0.995, "surer than before: {}, {least}", ratios[0]);
     assert!(shifts[shifts.len() - 1] < 0.3, "{}", shifts[shifts.len() - 1]);
 }
 
 /// Where the measurements agree, so that whole and condensed graph are linearised at one place, no direction of any
-/// relation is surer than before: to rounding if steps are compounded as they are, and as the wire has them.
+/// relation is surer than before, but for the floor that the graph puts below every factor (1.2e-8), and for rounding.
 #[test]
 fn a_condensed_log_is_never_surer_than_what_it_replaces() {
     let (mut compounded, mut written) = ([f64::INFINITY, 0.0], [f64::INFINITY, 0.0f64]);
@@ -233,9 +233,12 @@ fn a_condensed_log_is_never_surer_than_what_it_replaces() {
         }
     }
     println!("variance of the condensed by that of the whole: compounded {compounded:?}, written and read {written:?}");
-    assert!(compounded[0] > 1.0 - 1e-9 && compounded[1] < 1.0 + 1e-9, "{compounded:?}");
-    // Means are rounded to 24 bits, by which the two are linearised at places that far apart.
-    assert!(written[0] > 1.0 - 1e-6 && written[1] < 1.02, "{written:?}");
+    // The graph adds 1e-12 to every variance of every factor. One in place of four is so much surer, and no more: the
+    // smallest variance of a step is that of its rotation.
+    let floors = f64::from(GONE_IN_A_ROW_MAX) / f64::from(GONE_IN_A_ROW_MAX + 1) * 1e-12 / ODOMETRY.1.powi(2);
+    assert!(compounded[0] > 1.0 - floors - 1e-9 && compounded[1] < 1.0 + 1e-9, "{compounded:?}");
+    // Means are rounded to 24 bits, by which the two are linearised at places that far apart; covariances upwards.
+    assert!(written[0] > 1.0 - 1e-7 && written[1] < 1.05, "{written:?}");
 }
 
 /// The problem without the submaps that are not kept, their steps compounded, nothing rounded.

@@ -199,10 +199,8 @@ impl<'a> Halves<'a> {
             return Half::default();
         }
         for node in [a, b] {
-            if !self.of.contains_key(&node) {
-                let half = self.solve(node);
-                self.of.insert(node, half);
-            }
+            let half = self.of.remove(&node).unwrap_or_else(|| self.solve(node));
+            self.of.insert(node, half);
         }
         let t_b_a = self.solution.values[b].inverse() * self.solution.values[a];
         self.of[&b].minus(&t_b_a.adjoint(), &self.of[&a])
