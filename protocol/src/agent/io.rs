@@ -43,6 +43,7 @@ pub struct AskToken(pub u64);
 pub struct JobId(pub u64);
 
 /// Everything that can happen to an agent.
+#[expect(clippy::large_enum_variant, reason = "one input is handed over at a time, and none is kept")]
 #[derive(Clone, Debug)]
 pub enum Input {
     /// The robot's own SLAM finished a keyframe.

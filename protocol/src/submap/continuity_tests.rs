@@ -128,7 +128,7 @@ fn an_outlier_is_refused_and_nothing_else() {
 #[test]
 fn the_way_back_after_an_outlier_is_refused_too_if_it_is_too_far() {
     // Lost for ten seconds, of which each keyframe lies elsewhere; then where it would be.
-    let lost = |k: u32| timed(f64::from(k), at(f64::from(k) + if k % 2 == 0 { 300.0 } else { -300.0 }));
+    let lost = |k: u32| timed(f64::from(k), at(f64::from(k) + if k.is_multiple_of(2) { 300.0 } else { -300.0 }));
     let keyframes = [along(0, 12, 0.0), (12..22).map(lost).collect(), along(22, 40, 0.0)].concat();
     let taken = drive(&SubmapConfig::default(), &keyframes);
     assert_eq!(taken, Taken { refused: (12..25).collect(), frames: vec![25] });

@@ -56,8 +56,7 @@ impl Up {
     pub fn new(direction: [f64; 3], sigma: f64) -> Result<Self, UpError> {
         let direction = Vector3::from(direction);
         let length = direction.norm();
-        // Negated, so that NaN is refused too.
-        if !((length - 1.0).abs() <= UP_LENGTH_TOLERANCE) {
+        if !length.is_finite() || (length - 1.0).abs() > UP_LENGTH_TOLERANCE {
             return Err(UpError::Length(length));
         }
         if !UP_SIGMA_RANGE_RAD.contains(&sigma) {
