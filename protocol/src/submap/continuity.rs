@@ -6,7 +6,7 @@
 //! A longer one must be *possible*: not beyond `speed_max_m_s` (where the unit is the metre), `turn_max_deg_s` and
 //! [`JUMP_SUBMAPS_MAX`]. And, once it is known how this front end hands over keyframes, it must be *usual*: not beyond
 //! [`STEPS_MAX`] of its longest steps, nor beyond twice its speed for up to [`LOST_SECS_MAX`]. The last is relative, so that
-//! it holds in any unit, for a car as for a crawler. Each is widened by [`SIGMAS`] of the stated standard deviation: whoever
+//! it holds in any unit, for a car as for a crawler. Each is widened by four of the stated standard deviations: whoever
 //! says that he does not know the motion is believed.
 //!
 //! What time has passed counts only so far, since a SLAM that restarts takes seconds: what the body may have driven
