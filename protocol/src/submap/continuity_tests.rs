@@ -167,6 +167,19 @@ fn what_is_fast_or_seldom_is_no_restart() {
     assert_eq!(drive(&metres(), &quick), Taken::default());
 }
 
+/// A robot that saw nothing for long may be where it could have driven to, and not farther than is possible at all.
+#[test]
+fn after_a_long_silence_what_is_possible_goes_on() {
+    let silent = |secs: f64, way: f64| {
+        let onward = |k: u32| timed(20.0 + secs + f64::from(k), at(20.0 + way + f64::from(k)));
+        drive(&SubmapConfig::default(), &[along(0, 21, 0.0), (0..9).map(onward).collect()].concat())
+    };
+    let way = 0.9 * JUMP_SUBMAPS_MAX * SubmapConfig::default().distance_m;
+    assert_eq!(silent(SILENT_SECS_MIN, way), Taken::default());
+    assert_ne!(silent(SILENT_SECS_MIN - 0.1, way), Taken::default());
+    assert_ne!(silent(60.0, 2.0 * way), Taken::default());
+}
+
 /// A front end that hands keyframes over five times more seldom from now on loses some of them, and a frame, but is not
 /// refused for ever.
 #[test]
