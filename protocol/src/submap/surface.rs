@@ -57,11 +57,22 @@ pub fn normals(points: &[[f32; 3]], viewpoint: impl Fn(usize) -> Vector3<f64>) -
 fn moments(lanes: &Lanes<3>, at: &[f32; 3]) -> [f32; 10] {
     let mut sums = [[0.0; LANES]; 10];
     for [xs, ys, zs] in &lanes.groups {
+        let (mut x, mut y, mut z, mut d) = ([0.0; LANES], [0.0; LANES], [0.0; LANES], [0.0; LANES]);
+        let mut least = f32::MAX;
         for l in 0..LANES {
-            let (x, y, z) = (xs[l] - at[0], ys[l] - at[1], zs[l] - at[2]);
-            let w = if x * x + y * y + z * z <= NORMAL_RADIUS * NORMAL_RADIUS { 1.0 } else { 0.0 };
-            let (wx, wy, wz) = (w * x, w * y, w * z);
-            let terms = [w, wx, wy, wz, wx * x, wx * y, wx * z, wy * y, wy * z, wz * z];
+            (x[l], y[l], z[l]) = (xs[l] - at[0], ys[l] - at[1], zs[l] - at[2]);
+            d[l] = x[l] * x[l] + y[l] * y[l] + z[l] * z[l];
+        }
+        for squared in d {
+            least = if squared < least { squared } else { least };
+        }
+        if least > NORMAL_RADIUS * NORMAL_RADIUS {
+            continue;
+        }
+        for l in 0..LANES {
+            let w = if d[l] <= NORMAL_RADIUS * NORMAL_RADIUS { 1.0 } else { 0.0 };
+            let (wx, wy, wz) = (w * x[l], w * y[l], w * z[l]);
+            let terms = [w, wx, wy, wz, wx * x[l], wx * y[l], wx * z[l], wy * y[l], wy * z[l], wz * z[l]];
             for (sum, term) in sums.iter_mut().zip(terms) {
                 sum[l] += term;
             }
