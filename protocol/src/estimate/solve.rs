@@ -337,7 +337,7 @@ impl Part {
 }
 
 /// The variables of a factor: anchors without the first, then scales.
-fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
+pub(super) fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
     let anchors = graph.nodes().len().saturating_sub(1);
     let end = |node: usize| (node.checked_sub(1), graph.scale_of(node).map(|s| anchors + s));
     parts_of(end(edge.i), end(edge.j)).into_iter().flatten().collect()
