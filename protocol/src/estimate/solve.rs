@@ -255,7 +255,7 @@ impl RigidTerm {
     pub(super) fn new(edge: &Edge, values: &[Sim3]) -> Self {
         let (residual, by_j, adjoint) = edge.linearise_rigid(values);
         let (d, u) = (block(&by_j, 0, 0), block(&by_j, 0, 3));
-        let w = edge.information.fixed_view::<6, 6>(0, 0).into_owned();
+        let w = edge.information_rigid();
         let (w_tt, w_tr, w_rr) = (block(&w, 0, 0), block(&w, 0, 3), block(&w, 3, 3));
         let (d_t, u_t) = (d.transpose(), u.transpose());
         let left = [[d_t * w_tt, d_t * w_tr], [u_t * w_tt + d_t * w_tr.transpose(), u_t * w_tr + d_t * w_rr]];
@@ -309,7 +309,8 @@ fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal:
 
 fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[Slot], normal: &mut Normal) {
     let at = edge.linearise(values);
-    let weighted = edge.information * at.residual;
+    let information = edge.information();
+    let weighted = information * at.residual;
     let jacobians: Vec<SMatrix<f64, 7, 6>> = parts.iter().map(|(_, part)| columns(*part, &at.by_i, &at.by_j)).collect();
     let mut slots = slots.iter();
     for (p, (start, part)) in parts.iter().enumerate() {
@@ -317,7 +318,7 @@ fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[S
         for k in 0..part.size() {
             normal.g[start + k] += gradient[k];
         }
-        let left = jacobians[p].transpose() * edge.information;
+        let left = jacobians[p].transpose() * information;
         for (q, (_, other)) in parts.iter().enumerate().skip(p) {
             let block = left * jacobians[q];
             if let Some(&slot) = slots.next() {

@@ -136,7 +136,7 @@ fn relative_covariances_match_a_dense_inverse() {
         for (a, ja) in [(edge.i, at.by_i), (edge.j, at.by_j)] {
             for (b, jb) in [(edge.i, at.by_i), (edge.j, at.by_j)] {
                 if a > 0 && b > 0 {
-                    let block = ja.transpose() * edge.information * jb;
+                    let block = ja.transpose() * edge.information() * jb;
                     let mut view = h.view_mut((6 * (a - 1), 6 * (b - 1)), (6, 6));
                     view += block.fixed_view::<6, 6>(0, 0);
                 }
@@ -329,7 +329,7 @@ fn leave_one_out_equals_the_innovation_against_the_map_without_the_factor() {
     let without = solve(one_component(&truth, factors), start, 50).unwrap();
     let predicted = without.relative(tested.i, tested.j, &BTreeSet::new()).unwrap();
     let want = predicted.disagreement(&tested.t_i_j).distance_squared;
-    let edge = with.graph().edges().iter().find(|e| e.factor.label == tested.label).unwrap();
+    let edge = with.graph().edges().iter().find(|e| e.label == tested.label).unwrap();
     let LeftOut { chi2: got, dof, .. } = leave_one_out(&with, &with.selected_inverse(), edge).unwrap();
     assert!(dof == 6 && (got / want - 1.0).abs() < 0.02, "{got} {want}");
 }
