@@ -354,3 +354,25 @@ fn a_graph_that_is_tied_all_over_is_refused_before_it_takes_memory() {
     assert_eq!(minimum(&graph, start, 5).unwrap_err(), error);
     assert!(error.to_string().contains("4096 are allowed"), "{error}");
 }
+
+#[test]
+fn what_is_not_determined_is_named_by_its_submap_or_frame() {
+    let graph = {
+        let sim = SimWithCovariance { sim: Sim3::identity(), covariance: Covariance::from_sigmas([0.1; 7]).unwrap() };
+        let rigid = PoseWithCovariance { pose: Se3::identity(), covariance: sigmas(0.1, 0.1) };
+        let factor = |i, j, t_i_j| Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 };
+        let factors = vec![
+            factor(submap(0, 0), submap(1, 0), Relative::Similarity(sim)),
+            factor(submap(1, 0), submap(1, 1), Relative::Metric(rigid)),
+        ];
+        let nodes = [submap(0, 0), submap(1, 0), submap(1, 1)].into();
+        Graph::components(&nodes, &[frame(1)].into(), factors).unwrap().remove(0)
+    };
+    let of = |variable| SolveError::Underconstrained { variable }.of(&graph);
+    assert_eq!(of(0), SolveError::UnderconstrainedAnchor(submap(1, 0)));
+    assert_eq!(of(1), SolveError::UnderconstrainedAnchor(submap(1, 1)));
+    assert_eq!(of(2), SolveError::UnderconstrainedScale(frame(1)));
+    assert_eq!(of(3), SolveError::Underconstrained { variable: 3 });
+    assert_eq!(SolveError::NotFinite.of(&graph), SolveError::NotFinite);
+    assert_eq!(of(0).renamed(|id| SubmapId { index: 7, ..id }), SolveError::UnderconstrainedAnchor(submap(1, 7)));
+}
