@@ -5,7 +5,7 @@ use super::two_sided;
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
 use crate::estimate::ends::End;
-use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, Shortfall, solve_map};
+use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, Shortfall, Unused, solve_map};
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
@@ -132,6 +132,16 @@ impl Solved {
             self.ends = self.ends.into_iter().map(|(id, end)| (index(id), end)).collect();
             for AgreedAlignment { i, j, .. } in self.edges.iter_mut().map(|edge| &mut edge.measurement) {
                 (*i, *j) = (index(*i), index(*j));
+            }
+            for edge in &mut self.edges {
+                if let Some(Unused::Failed(error)) = &mut edge.unused {
+                    *error = error.renamed(index);
+                }
+            }
+            for (_, why) in &mut self.failed {
+                if let Shortfall::Unsolved(error) = why {
+                    *error = error.renamed(index);
+                }
             }
         }
         self

@@ -5,6 +5,7 @@ use super::Agent;
 use super::knowledge::Agreement;
 use crate::estimate::EdgeKind;
 use crate::estimate::joint::Shortfall;
+use crate::estimate::solve::SolveError;
 use crate::geometry::Se3;
 use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
 use crate::snapshot::{
@@ -175,7 +176,7 @@ impl Agent {
         edges.extend(self.unused_edges(&listed));
         let failed = |(frames, why): &(Vec<FrameId>, Shortfall)| FailedView {
             frames: frames.iter().map(|frame| self.frame_name(*frame)).collect(),
-            reason: why.to_string(),
+            reason: self.shortfall(why),
         };
         let nodes = solved.nodes + self.map.alone.values().sum::<usize>();
         GraphView {
@@ -186,6 +187,20 @@ impl Agent {
             converged: solved.converged,
             failed: solved.failed.iter().map(failed).collect(),
             edges,
+        }
+    }
+
+    /// What a component falls short of, in the names that the views have.
+    fn shortfall(&self, why: &Shortfall) -> String {
+        let text = why.to_string();
+        match why {
+            Shortfall::Unsolved(SolveError::UnderconstrainedAnchor(id)) => {
+                text.replace(&id.to_string(), &self.submap_name(*id))
+            }
+            Shortfall::Unsolved(SolveError::UnderconstrainedScale(frame)) => {
+                text.replace(&frame.to_string(), &self.frame_name(*frame))
+            }
+            _ => text,
         }
     }
 

@@ -55,7 +55,7 @@ fn dense_inverse(solution: &Solution) -> DMatrix<f64> {
     for edge in solution.graph.edges() {
         let at = edge.linearise(&solution.values);
         let jacobian = at.by_i * row_block(solution, edge.i) + at.by_j * row_block(solution, edge.j);
-        h += jacobian.transpose() * edge.information * &jacobian;
+        h += jacobian.transpose() * edge.information() * &jacobian;
     }
     h.cholesky().unwrap().inverse()
 }

@@ -54,7 +54,7 @@ pub(super) fn ends<'a>(
     walks: impl Iterator<Item = (SubmapId, &'a Covariance<6>)>,
 ) -> BTreeMap<SubmapId, End> {
     let clouds = solution.graph().factors().filter(|factor| factor.label == Label::Cloud);
-    let clouds: BTreeMap<SubmapId, (SubmapId, &Relative)> = clouds.map(|f| (f.i, (f.j, &f.t_i_j))).collect();
+    let clouds: BTreeMap<SubmapId, (SubmapId, Relative)> = clouds.map(|f| (f.i, (f.j, f.t_i_j))).collect();
     let of = |(anchor, walk): (SubmapId, &Covariance<6>)| {
         let (cloud, t_anchor_cloud) = clouds.get(&anchor)?;
         let off_together = solution.covariance_onward(reference, anchor, *cloud)?;

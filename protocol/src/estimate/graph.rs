@@ -6,7 +6,7 @@
 //! `∂r/∂δ_i = −J_l⁻¹(r) Ad(t_i_j⁻¹)`. Gauge: the smallest [`SubmapId`] of a component is held fixed.
 
 use crate::geometry::sim3::{self, Matrix7, Vector7};
-use crate::geometry::{Covariance, Relative, Se3, Sim3, se3};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, se3};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use nalgebra::{Matrix6, SMatrix, Vector6};
 use std::collections::{BTreeMap, BTreeSet};
@@ -15,6 +15,9 @@ use thiserror::Error;
 /// Added to every variance (m², rad²): nobody is surer than a micrometre, and no factor's information dwarfs the others
 /// so far that the factorisation fails.
 const VARIANCE_MIN: f64 = 1e-12;
+
+/// Room is made for one factor more to so many that a graph has: what it grows by at first needs no copy of them all.
+const FACTORS_SPARE: usize = 16;
 
 /// Where a factor comes from; part of the canonical order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -98,14 +101,27 @@ pub struct Graph {
     factors: Vec<Edge>,
 }
 
-/// A factor with its nodes resolved.
+/// A factor with its nodes resolved. A map has three of them to an anchor, so that no number is held twice.
 #[derive(Clone, Debug)]
 pub(super) struct Edge {
-    pub(super) factor: Factor,
+    pub(super) label: Label,
+    pub(super) weight: f64,
     pub(super) i: usize,
     pub(super) j: usize,
-    /// Information of the residual, weight included; the scale row is zero for rigid measurements.
-    pub(super) information: Matrix7,
+    measured: Measured,
+}
+
+/// A measurement, and the information of the residual with the weight in it.
+#[derive(Clone, Debug)]
+#[expect(clippy::large_enum_variant, reason = "nearly all are rigid, and a box of each would cost time and memory")]
+enum Measured {
+    Rigid {
+        pose: Se3,
+        covariance: [f64; 21],
+        information: Matrix6<f64>,
+    },
+    /// Few are, and they are twice as large.
+    Similar(Box<(SimWithCovariance, Matrix7)>),
 }
 
 /// A factor's residual and its Jacobians by local perturbations (ρ, φ, λ) of both ends.
@@ -135,7 +151,7 @@ impl Graph {
         order.sort_by(|&a, &b| canonical(&factors[a], &factors[b]));
         let index: BTreeMap<SubmapId, usize> = nodes.iter().enumerate().map(|(k, &id)| (id, k)).collect();
         let mut sets = Disjoint::new(nodes.len());
-        let mut edges = Vec::with_capacity(factors.len());
+        let mut edges = Vec::with_capacity(factors.len() + factors.len() / FACTORS_SPARE);
         for factor in order.into_iter().map(|k| factors[k]) {
             let edge = Edge::new(factor, |id| index.get(&id).copied(), unknown_scale)?;
             sets.join(edge.i, edge.j);
@@ -171,8 +187,12 @@ impl Graph {
     }
 
     /// The factors in canonical order.
-    pub fn factors(&self) -> impl ExactSizeIterator<Item = &Factor> {
-        self.factors.iter().map(|e| &e.factor)
+    pub fn factors(&self) -> impl ExactSizeIterator<Item = Factor> + '_ {
+        let factor = |e: &Edge| {
+            let (i, j) = (self.nodes[e.i], self.nodes[e.j]);
+            Factor { label: e.label, i, j, t_i_j: e.t_i_j(), weight: e.weight }
+        };
+        self.factors.iter().map(factor)
     }
 
     /// Number of scale variables.
@@ -220,52 +240,104 @@ impl Edge {
         if same_unit != matches!(factor.t_i_j, Relative::Metric(_)) {
             return Err(GraphError::Units { i, j });
         }
-        let mut information = Matrix7::zeros();
-        match &factor.t_i_j {
+        let Factor { label, weight, .. } = factor;
+        let measured = match factor.t_i_j {
             Relative::Metric(p) => {
-                information.fixed_view_mut::<6, 6>(0, 0).copy_from(&information_of(&p.covariance));
+                let (covariance, information) = (p.covariance.packed(), information_of(&p.covariance) * weight);
+                Measured::Rigid { pose: p.pose, covariance, information }
             }
-            Relative::Similarity(s) => information = information_of(&s.covariance),
+            Relative::Similarity(s) => Measured::Similar(Box::new((s, information_of(&s.covariance) * weight))),
+        };
+        Ok(Self { label, weight, i: a, j: b, measured })
+    }
+
+    /// As it was measured.
+    pub(super) fn t_i_j(&self) -> Relative {
+        match &self.measured {
+            Measured::Rigid { pose, covariance, .. } => {
+                Relative::Metric(PoseWithCovariance { pose: *pose, covariance: Covariance::unpacked(covariance) })
+            }
+            Measured::Similar(similar) => Relative::Similarity(similar.0),
         }
-        information *= factor.weight;
-        Ok(Self { factor, i: a, j: b, information })
+    }
+
+    /// Its mean.
+    pub(super) fn mean(&self) -> Sim3 {
+        match &self.measured {
+            Measured::Rigid { pose, .. } => Sim3::from_se3(pose),
+            Measured::Similar(similar) => similar.0.sim,
+        }
+    }
+
+    /// Whether it says nothing of scales.
+    pub(super) fn is_rigid(&self) -> bool {
+        matches!(self.measured, Measured::Rigid { .. })
+    }
+
+    /// Information of the residual, weight included; the scale row is zero for rigid measurements.
+    pub(super) fn information(&self) -> Matrix7 {
+        match &self.measured {
+            Measured::Rigid { information, .. } => {
+                let mut out = Matrix7::zeros();
+                out.fixed_view_mut::<6, 6>(0, 0).copy_from(information);
+                out
+            }
+            Measured::Similar(similar) => similar.1,
+        }
+    }
+
+    /// Its trace.
+    pub(super) fn information_trace(&self) -> f64 {
+        match &self.measured {
+            Measured::Rigid { information, .. } => information.trace(),
+            Measured::Similar(similar) => similar.1.trace(),
+        }
+    }
+
+    /// The information of the pose alone.
+    pub(super) fn information_rigid(&self) -> Matrix6<f64> {
+        match &self.measured {
+            Measured::Rigid { information, .. } => *information,
+            Measured::Similar(similar) => similar.1.fixed_view::<6, 6>(0, 0).into_owned(),
+        }
     }
 
     /// Dimension of the measurement.
     pub(super) fn dimension(&self) -> usize {
-        match self.factor.t_i_j {
-            Relative::Metric(_) if matches!(self.factor.label, Label::Position(_)) => super::position::DIMENSION,
-            Relative::Metric(_) => 6,
-            Relative::Similarity(_) => 7,
+        match self.measured {
+            Measured::Rigid { .. } if matches!(self.label, Label::Position(_)) => super::position::DIMENSION,
+            Measured::Rigid { .. } => 6,
+            Measured::Similar(_) => 7,
         }
     }
 
     /// `log(t_i_j⁻¹ X_i⁻¹ X_j)`; the scale component is 0 for rigid measurements.
     pub(super) fn residual(&self, values: &[Sim3]) -> Vector7 {
         let t_i_j = values[self.i].inverse() * values[self.j];
-        match &self.factor.t_i_j {
-            Relative::Metric(p) => lift(&p.pose.local(&t_i_j.to_se3())),
-            Relative::Similarity(s) => s.sim.local(&t_i_j),
+        match &self.measured {
+            Measured::Rigid { pose, .. } => lift(&pose.local(&t_i_j.to_se3())),
+            Measured::Similar(similar) => similar.0.sim.local(&t_i_j),
         }
     }
 
     /// The weighted square of the residual.
     pub(super) fn chi2(&self, values: &[Sim3]) -> f64 {
         let r = self.residual(values);
-        match &self.factor.t_i_j {
-            Relative::Metric(_) => {
+        match &self.measured {
+            Measured::Rigid { information, .. } => {
                 let r = r.fixed_rows::<6>(0);
-                r.dot(&(self.information.fixed_view::<6, 6>(0, 0) * r))
+                r.dot(&(information * r))
             }
-            Relative::Similarity(_) => r.dot(&(self.information * r)),
+            Measured::Similar(similar) => r.dot(&(similar.1 * r)),
         }
     }
 
     pub(super) fn linearise(&self, values: &[Sim3]) -> Linearised {
         let t_i_j = values[self.i].inverse() * values[self.j];
-        match &self.factor.t_i_j {
-            Relative::Metric(p) => linearise_rigid(&p.pose, &t_i_j.to_se3()),
-            Relative::Similarity(s) => {
+        match &self.measured {
+            Measured::Rigid { pose, .. } => linearise_rigid(pose, &t_i_j.to_se3()),
+            Measured::Similar(similar) => {
+                let s = &similar.0;
                 let residual = s.sim.local(&t_i_j);
                 let by_i = -sim3::left_jacobian_inv(&residual) * s.sim.inverse().adjoint();
                 Linearised { residual, by_i, by_j: sim3::right_jacobian_inv(&residual) }
@@ -279,7 +351,7 @@ impl Edge {
     /// which `∂r/∂δ_i = −J_l⁻¹(r) Ad(t_i_j⁻¹) = −J_r⁻¹(r) A`.
     pub(super) fn linearise_rigid(&self, values: &[Sim3]) -> (Vector6<f64>, Matrix6<f64>, Matrix6<f64>) {
         let t_i_j = (values[self.i].inverse() * values[self.j]).to_se3();
-        let residual = self.factor.t_i_j.sim().to_se3().local(&t_i_j);
+        let residual = self.mean().to_se3().local(&t_i_j);
         (residual, se3::right_jacobian_inv(&residual), t_i_j.inverse().adjoint())
     }
 }

@@ -308,7 +308,7 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
                 let place = |id: &SubmapId| start.get(id).or_else(|| start.get(&distortion::anchor_of(*id))).copied();
                 let start = graph.nodes().iter().map(|id| place(id).unwrap_or_else(Sim3::identity));
                 let start = start.collect();
-                solve_within(graph, start, iterations_max, MAP_BYTES_MAX)
+                solve_within(graph, start, iterations_max, MAP_BYTES_MAX).map_err(|e| e.renamed(distortion::anchor_of))
             }
             // Intake admits only what a graph accepts, and a chain is connected.
             _ => Err(SolveError::NotFinite),

@@ -5,7 +5,7 @@
 //! anchors relative to one take seven solves and one selected inversion (MATH §3: joint covariances, never sums of
 //! marginals).
 
-use super::solve::Solution;
+use super::solve::{Solution, variables_of};
 use super::sparse::SelectedInverse;
 use crate::geometry::sim3::{Matrix7, Vector7};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
@@ -35,7 +35,8 @@ impl Solution {
     pub fn relatives_to(&self, reference: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Vec<(SubmapId, Relative)> {
         let Some(r) = self.graph.position(reference) else { return Vec::new() };
         let Some(columns) = self.columns_of(&self.row_block(r, &Matrix7::identity())) else { return Vec::new() };
-        let inverse = self.selected_inverse();
+        let with_scale = |k: usize| Some((self.variables(k)[0]?.0, self.variables(k)[6]?.0));
+        let inverse = self.pattern.selected_inverse(&self.factor, (0..self.values.len()).filter_map(with_scale));
         let at_reference = self.rows(&columns, r);
         let anchors = self.graph.nodes().iter().enumerate();
         let one = |(k, &id): (usize, &SubmapId)| {
@@ -106,9 +107,14 @@ impl Solution {
         Some((joint + joint.transpose()) * 0.5)
     }
 
-    /// The entries of `H⁻¹` in the pattern of its factor.
+    /// The blocks of `H⁻¹` where `H` has any: of each variable, and of those that a factor ties.
     pub(super) fn selected_inverse(&self) -> SelectedInverse<'_> {
-        self.pattern.selected_inverse(&self.factor)
+        let pairs = self.graph.edges().iter().flat_map(|edge| {
+            let variables = variables_of(&self.graph, edge);
+            let later = |k: usize| variables[k + 1..].iter().map(|(b, _)| (variables[k].0, *b)).collect::<Vec<_>>();
+            (0..variables.len()).flat_map(later).collect::<Vec<_>>()
+        });
+        self.pattern.selected_inverse(&self.factor, pairs)
     }
 
     /// The row block A of `δ_b − Ad δ_a` as (scalar, column of A).

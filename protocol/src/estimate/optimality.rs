@@ -34,7 +34,7 @@ impl Solution {
         if self.values.len() < 2 {
             return Optimality::Certified;
         }
-        let edges: Option<Vec<ChordalEdge>> = self.graph.factors().map(|factor| self.isotropic(factor)).collect();
+        let edges: Option<Vec<ChordalEdge>> = self.graph.factors().map(|factor| self.isotropic(&factor)).collect();
         let Some(edges) = edges.filter(|_| self.graph.scale_count() == 0) else { return Optimality::NotApplicable };
         let chordal = ChordalGraph { nodes: self.values.len(), edges };
         let start: Vec<_> = self.values.iter().map(Sim3::to_se3).collect();

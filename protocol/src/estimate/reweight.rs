@@ -45,12 +45,12 @@ pub(super) struct Drop {
 /// that fail once `round` has reached the limit.
 pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
     let inverse = solution.selected_inverse();
-    let tested = solution.graph().edges().iter().filter(|e| e.factor.label.is_doubted());
+    let tested = solution.graph().edges().iter().filter(|e| e.label.is_doubted());
     let failing = tested.filter_map(|edge| {
         let LeftOut { chi2, dof, .. } = leave_one_out(solution, &inverse, edge)?;
         // A position says nothing of how what it saw is turned.
         let limit = CHI2_999.get(dof.min(edge.dimension()).checked_sub(1)?)?;
-        (chi2 > *limit).then_some((chi2 / limit, Drop { label: edge.factor.label, chi2 }))
+        (chi2 > *limit).then_some((chi2 / limit, Drop { label: edge.label, chi2 }))
     });
     let mut failing: Vec<(f64, Drop)> = failing.collect();
     failing.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -75,17 +75,17 @@ pub(super) struct LeftOut {
 pub(super) fn leave_one_out(solution: &Solution, inverse: &SelectedInverse<'_>, edge: &Edge) -> Option<LeftOut> {
     let residual = edge.residual(solution.values());
     let predicted = solution.covariance_along(inverse, edge.i, edge.j)?;
-    match &edge.factor.t_i_j {
+    match &edge.t_i_j() {
         Relative::Metric(p) => {
             let r = residual.fixed_rows::<6>(0).into_owned();
             let j = se3::right_jacobian_inv(&r);
             let predicted = j * predicted.fixed_view::<6, 6>(0, 0) * j.transpose();
-            deletion(&r, &(p.covariance.matrix() / edge.factor.weight), &predicted)
+            deletion(&r, &(p.covariance.matrix() / edge.weight), &predicted)
         }
         Relative::Similarity(s) => {
             let j: Matrix7 = sim3::right_jacobian_inv(&residual);
             let r: Vector7 = residual;
-            deletion(&r, &(s.covariance.matrix() / edge.factor.weight), &(j * predicted * j.transpose()))
+            deletion(&r, &(s.covariance.matrix() / edge.weight), &(j * predicted * j.transpose()))
         }
     }
 }

@@ -7,6 +7,7 @@ use super::graph::{Edge, Graph};
 use super::minimise::{Minimum, Normal, Objective, minimise};
 use super::sparse::{BlockPattern, Factor, Slot};
 use crate::geometry::{Se3, Sim3, se3};
+use crate::ids::{FrameId, SubmapId};
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector6};
 use std::sync::Arc;
 use thiserror::Error;
@@ -22,6 +23,12 @@ pub enum SolveError {
         /// Variable in canonical order (anchors without the first, then scales).
         variable: usize,
     },
+    /// The measurements leave a submap's anchor free, or are too ill-conditioned to tell.
+    #[error("submap {0} is not determined by its measurements")]
+    UnderconstrainedAnchor(SubmapId),
+    /// The measurements leave a frame's unit free, or are too ill-conditioned to tell.
+    #[error("the scale of frame {0} is not determined by its measurements")]
+    UnderconstrainedScale(FrameId),
     /// An intermediate number overflowed.
     #[error("numbers overflowed; check the measurements' magnitudes")]
     NotFinite,
@@ -50,6 +57,27 @@ pub enum SolveError {
     /// Memory for the factorisation could not be had.
     #[error("not enough memory for the factorisation; free some, or solve fewer poses at a time")]
     OutOfMemory,
+}
+
+impl SolveError {
+    /// The error with its submap named otherwise.
+    #[must_use]
+    pub fn renamed(self, name: impl Fn(SubmapId) -> SubmapId) -> Self {
+        match self {
+            Self::UnderconstrainedAnchor(id) => Self::UnderconstrainedAnchor(name(id)),
+            other => other,
+        }
+    }
+
+    /// The error of solving `graph`, with what its variable belongs to.
+    pub(super) fn of(self, graph: &Graph) -> Self {
+        let Self::Underconstrained { variable } = self else { return self };
+        let anchors = graph.nodes().len().saturating_sub(1);
+        let anchor = graph.nodes().get(variable + 1).map(|&id| Self::UnderconstrainedAnchor(id));
+        let has_scale = |k: &usize| variable >= anchors && graph.scale_of(*k) == Some(variable - anchors);
+        let scale = || (0..graph.nodes().len()).find(has_scale).map(|k| graph.nodes()[k].frame);
+        anchor.or_else(|| scale().map(Self::UnderconstrainedScale)).unwrap_or(self)
+    }
 }
 
 /// A solved component: estimates, and the factorisation from which covariances are drawn.
@@ -100,7 +128,8 @@ pub struct ChiSquaredMinimum {
 /// As [`solve`], but a direction that no measurement determines may pass unseen.
 pub fn minimum(graph: &Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<ChiSquaredMinimum, SolveError> {
     expect_start(graph, &start)?;
-    let found = minimise(&System::new(graph, FACTOR_BYTES_MAX)?, start, iterations_max)?;
+    let system = System::new(graph, FACTOR_BYTES_MAX)?;
+    let found = minimise(&system, start, iterations_max).map_err(|error| error.of(graph))?;
     let (chi2, iterations, converged) = (found.cost, found.iterations, found.converged);
     Ok(ChiSquaredMinimum { values: found.values, chi2, iterations, converged })
 }
@@ -131,9 +160,10 @@ pub fn solve_within(
 ) -> Result<Solution, SolveError> {
     expect_start(&graph, &start)?;
     let system = System::new(&graph, bytes_max)?;
-    let Minimum { values, cost: chi2, iterations, converged, mut normal } = minimise(&system, start, iterations_max)?;
+    let found = minimise(&system, start, iterations_max).map_err(|error| error.of(&graph))?;
+    let Minimum { values, cost: chi2, iterations, converged, mut normal } = found;
     normal.at(&system, &values)?;
-    let factor = normal.factorised(&system.pattern)?;
+    let factor = normal.factorised(&system.pattern).map_err(|error| error.of(&graph))?;
     let residuals: usize = graph.edges().iter().map(Edge::dimension).sum();
     let dof = residuals.saturating_sub(system.pattern.scalars());
     let pattern = Arc::new(system.pattern);
@@ -255,7 +285,7 @@ impl RigidTerm {
     pub(super) fn new(edge: &Edge, values: &[Sim3]) -> Self {
         let (residual, by_j, adjoint) = edge.linearise_rigid(values);
         let (d, u) = (block(&by_j, 0, 0), block(&by_j, 0, 3));
-        let w = edge.information.fixed_view::<6, 6>(0, 0).into_owned();
+        let w = edge.information_rigid();
         let (w_tt, w_tr, w_rr) = (block(&w, 0, 0), block(&w, 0, 3), block(&w, 3, 3));
         let (d_t, u_t) = (d.transpose(), u.transpose());
         let left = [[d_t * w_tt, d_t * w_tr], [u_t * w_tt + d_t * w_tr.transpose(), u_t * w_tr + d_t * w_rr]];
@@ -309,7 +339,8 @@ fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal:
 
 fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[Slot], normal: &mut Normal) {
     let at = edge.linearise(values);
-    let weighted = edge.information * at.residual;
+    let information = edge.information();
+    let weighted = information * at.residual;
     let jacobians: Vec<SMatrix<f64, 7, 6>> = parts.iter().map(|(_, part)| columns(*part, &at.by_i, &at.by_j)).collect();
     let mut slots = slots.iter();
     for (p, (start, part)) in parts.iter().enumerate() {
@@ -317,7 +348,7 @@ fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[S
         for k in 0..part.size() {
             normal.g[start + k] += gradient[k];
         }
-        let left = jacobians[p].transpose() * edge.information;
+        let left = jacobians[p].transpose() * information;
         for (q, (_, other)) in parts.iter().enumerate().skip(p) {
             let block = left * jacobians[q];
             if let Some(&slot) = slots.next() {
@@ -337,7 +368,7 @@ impl Part {
 }
 
 /// The variables of a factor: anchors without the first, then scales.
-fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
+pub(super) fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
     let anchors = graph.nodes().len().saturating_sub(1);
     let end = |node: usize| (node.checked_sub(1), graph.scale_of(node).map(|s| anchors + s));
     parts_of(end(edge.i), end(edge.j)).into_iter().flatten().collect()

@@ -136,7 +136,7 @@ fn relative_covariances_match_a_dense_inverse() {
         for (a, ja) in [(edge.i, at.by_i), (edge.j, at.by_j)] {
             for (b, jb) in [(edge.i, at.by_i), (edge.j, at.by_j)] {
                 if a > 0 && b > 0 {
-                    let block = ja.transpose() * edge.information * jb;
+                    let block = ja.transpose() * edge.information() * jb;
                     let mut view = h.view_mut((6 * (a - 1), 6 * (b - 1)), (6, 6));
                     view += block.fixed_view::<6, 6>(0, 0);
                 }
@@ -329,7 +329,7 @@ fn leave_one_out_equals_the_innovation_against_the_map_without_the_factor() {
     let without = solve(one_component(&truth, factors), start, 50).unwrap();
     let predicted = without.relative(tested.i, tested.j, &BTreeSet::new()).unwrap();
     let want = predicted.disagreement(&tested.t_i_j).distance_squared;
-    let edge = with.graph().edges().iter().find(|e| e.factor.label == tested.label).unwrap();
+    let edge = with.graph().edges().iter().find(|e| e.label == tested.label).unwrap();
     let LeftOut { chi2: got, dof, .. } = leave_one_out(&with, &with.selected_inverse(), edge).unwrap();
     assert!(dof == 6 && (got / want - 1.0).abs() < 0.02, "{got} {want}");
 }
@@ -353,4 +353,26 @@ fn a_graph_that_is_tied_all_over_is_refused_before_it_takes_memory() {
     assert!(matches!(error, SolveError::TooDense { limit: FACTOR_BYTES_MAX, .. }), "{error}");
     assert_eq!(minimum(&graph, start, 5).unwrap_err(), error);
     assert!(error.to_string().contains("4096 are allowed"), "{error}");
+}
+
+#[test]
+fn what_is_not_determined_is_named_by_its_submap_or_frame() {
+    let graph = {
+        let sim = SimWithCovariance { sim: Sim3::identity(), covariance: Covariance::from_sigmas([0.1; 7]).unwrap() };
+        let rigid = PoseWithCovariance { pose: Se3::identity(), covariance: sigmas(0.1, 0.1) };
+        let factor = |i, j, t_i_j| Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 };
+        let factors = vec![
+            factor(submap(0, 0), submap(1, 0), Relative::Similarity(sim)),
+            factor(submap(1, 0), submap(1, 1), Relative::Metric(rigid)),
+        ];
+        let nodes = [submap(0, 0), submap(1, 0), submap(1, 1)].into();
+        Graph::components(&nodes, &[frame(1)].into(), factors).unwrap().remove(0)
+    };
+    let of = |variable| SolveError::Underconstrained { variable }.of(&graph);
+    assert_eq!(of(0), SolveError::UnderconstrainedAnchor(submap(1, 0)));
+    assert_eq!(of(1), SolveError::UnderconstrainedAnchor(submap(1, 1)));
+    assert_eq!(of(2), SolveError::UnderconstrainedScale(frame(1)));
+    assert_eq!(of(3), SolveError::Underconstrained { variable: 3 });
+    assert_eq!(SolveError::NotFinite.of(&graph), SolveError::NotFinite);
+    assert_eq!(of(0).renamed(|id| SubmapId { index: 7, ..id }), SolveError::UnderconstrainedAnchor(submap(1, 7)));
 }

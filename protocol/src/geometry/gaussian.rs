@@ -138,6 +138,24 @@ impl<const N: usize> Covariance<N> {
     }
 }
 
+impl Covariance<6> {
+    /// The lower triangle, column by column: all that there is, and little more than half of the matrix.
+    pub(crate) fn packed(&self) -> [f64; 21] {
+        let mut out = [0.0; 21];
+        let below = (0..6).flat_map(|c| (c..6).map(move |r| (r, c)));
+        out.iter_mut().zip(below).for_each(|(x, at)| *x = self.0[at]);
+        out
+    }
+
+    /// The covariance, to the bit, that was packed.
+    pub(crate) fn unpacked(packed: &[f64; 21]) -> Self {
+        let mut out = Matrix6::zeros();
+        let below = (0..6).flat_map(|c| (c..6).map(move |r| (r, c)));
+        packed.iter().zip(below).for_each(|(&x, (r, c))| (out[(r, c)], out[(c, r)]) = (x, x));
+        Self(out)
+    }
+}
+
 /// Positive definite also after scaling to unit diagonal, so that mixed units do not hide a tiny negative eigenvalue.
 fn is_positive_definite<const N: usize>(m: &SMatrix<f64, N, N>) -> bool {
     let d = m.diagonal().map(|v| 1.0 / v.sqrt());
@@ -272,6 +290,15 @@ mod tests {
     use super::super::test_support::{covariance, matrix, pose, rng, similarity};
     use super::*;
     use nalgebra::Vector6;
+
+    #[test]
+    fn packing_keeps_every_bit() {
+        let rng = &mut rng(30);
+        for _ in 0..100 {
+            let p: Covariance<6> = covariance(rng);
+            assert_eq!(Covariance::unpacked(&p.packed()), p);
+        }
+    }
 
     /// Propagates a covariance through `f` numerically: Σ = J Σ₀ Jᵀ with J by central differences at 0.
     fn numeric<const N: usize, const M: usize>(

@@ -139,10 +139,8 @@ impl Incremental {
         }
         let frames = &model.frames;
         model.unknown_scale = unknown_scale.iter().filter(|frame| frames.contains_key(frame)).copied().collect();
-        for edge in graph.into_edges() {
-            model.push_edge(edge);
-            tree.add_term();
-        }
+        model.take_edges(graph.into_edges());
+        model.edges.iter().for_each(|_| tree.add_term());
         let (variables, terms): (Vec<usize>, Vec<usize>) =
             ((0..model.owners.len()).collect(), (0..model.edges.len()).collect());
         let result = tree.revise(&model, (&[], &[]), (&variables, &terms));

@@ -68,6 +68,14 @@ impl Model {
         self.estimates.push(point);
     }
 
+    /// The factors that there are at first, which are too many to be moved.
+    pub(super) fn take_edges(&mut self, edges: Vec<Edge>) {
+        for (k, edge) in edges.iter().enumerate() {
+            [edge.i, edge.j].into_iter().for_each(|node| self.nodes[node].edges.push(k));
+        }
+        self.edges = edges;
+    }
+
     pub(super) fn push_edge(&mut self, edge: Edge) {
         for node in [edge.i, edge.j] {
             self.nodes[node].edges.push(self.edges.len());
@@ -189,8 +197,8 @@ impl Model {
             return None;
         }
         let (turn, shift) = (phi_i.norm() + phi_j.norm(), rho_i.norm() + rho_j.norm());
-        let length = 1.0 + edge.factor.t_i_j.sim().translation.norm();
-        Some(edge.information.trace().sqrt() * turn * (shift + turn * length))
+        let length = 1.0 + edge.mean().translation.norm();
+        Some(edge.information_trace().sqrt() * turn * (shift + turn * length))
     }
 
     /// By how many standard deviations the linear residual is off.
@@ -202,7 +210,7 @@ impl Model {
         };
         let linear = at.residual + at.by_i * tangent(edge.i) + at.by_j * tangent(edge.j);
         let off = edge.residual(&self.estimates) - linear;
-        off.dot(&(edge.information * off)).max(0.0).sqrt()
+        off.dot(&(edge.information() * off)).max(0.0).sqrt()
     }
 
     /// How the local perturbation of an anchor's estimate follows from that of its δ.
@@ -246,13 +254,14 @@ impl Terms for Model {
             return;
         }
         let at = edge.linearise(&self.points);
-        let weighted = edge.information * at.residual;
+        let information = edge.information();
+        let weighted = information * at.residual;
         let of = |(variable, part): (usize, Part)| (variable, part.size(), columns(part, &at.by_i, &at.by_j));
         let parts: Vec<(usize, usize, SMatrix<f64, 7, 6>)> = parts.into_iter().flatten().map(of).collect();
         for (k, (p, size, jacobian)) in parts.iter().enumerate() {
             let gradient = -(jacobian.transpose() * weighted);
             sum.rhs(*p, gradient.iter().take(*size));
-            let left = jacobian.transpose() * edge.information;
+            let left = jacobian.transpose() * information;
             for (q, other, by_other) in &parts[k..] {
                 sum.block(*p, *q, &(left * by_other).view((0, 0), (*size, *other)));
             }

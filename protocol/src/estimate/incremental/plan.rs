@@ -4,7 +4,7 @@
 use super::super::graph::{Edge, Factor, canonical};
 use super::model::Model;
 use super::{Addition, IncrementalError};
-use crate::geometry::{Relative, Sim3};
+use crate::geometry::Sim3;
 use crate::ids::{FrameId, SubmapId};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -87,7 +87,7 @@ impl Model {
                 Some(new) => estimates[new],
                 None => Some(self.estimates[node]),
             };
-            let t_i_j = edge.factor.t_i_j.sim();
+            let t_i_j = edge.mean();
             let (new, mut reached) = match (value(edge.i), value(edge.j)) {
                 (Some(i), None) => (edge.j - known, i * t_i_j),
                 (None, Some(j)) => (edge.i - known, j * t_i_j.inverse()),
@@ -129,7 +129,7 @@ fn hung(known: usize, count: usize, edges: &[Edge]) -> Vec<(usize, usize)> {
     while let Some(new) = queue.pop_front() {
         let Some(&k) = edges_of[new].iter().find(|&&k| !is_peeled[k]) else { continue };
         let edge = &edges[k];
-        if !matches!(edge.factor.t_i_j, Relative::Metric(_)) {
+        if !edge.is_rigid() {
             continue;
         }
         is_peeled[k] = true;

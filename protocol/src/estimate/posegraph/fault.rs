@@ -115,19 +115,26 @@ impl PoseGraph {
     /// The solver's error in terms of this graph, which is one that it could not solve.
     pub(super) fn told(&self, error: SolveError) -> PoseGraphError {
         let fault = match error {
-            SolveError::Underconstrained { .. } | SolveError::NotFinite if self.parts().len() > 1 => {
+            SolveError::Underconstrained { .. } | SolveError::UnderconstrainedAnchor(_) | SolveError::NotFinite
+                if self.parts().len() > 1 =>
+            {
                 return PoseGraphError::Parts(self.parts().len());
             }
-            SolveError::Underconstrained { variable } => self.undetermined(variable),
+            // Variables are the poses in ascending order, without the first, which is held.
+            SolveError::Underconstrained { variable } => self.undetermined(variable + 1),
+            SolveError::UnderconstrainedAnchor(id) => self.undetermined(id.index as usize),
             SolveError::NotFinite => self.overflow(),
-            SolveError::Start { .. } | SolveError::TooDense { .. } | SolveError::OutOfMemory => None,
+            SolveError::UnderconstrainedScale(_)
+            | SolveError::Start { .. }
+            | SolveError::TooDense { .. }
+            | SolveError::OutOfMemory => None,
         };
         fault.unwrap_or(PoseGraphError::Solve(error))
     }
 
-    /// Variables are the poses in ascending order, without the first, which is held.
-    fn undetermined(&self, variable: usize) -> Option<PoseGraphError> {
-        let pose = *self.poses.keys().nth(variable + 1)?;
+    /// The fault that leaves the pose at a place in ascending order free.
+    fn undetermined(&self, place: usize) -> Option<PoseGraphError> {
+        let pose = *self.poses.keys().nth(place)?;
         let most = self.measurements.iter().map(most).fold(0.0, f64::max);
         let least = |m: &Measurement| m.information.symmetric_eigenvalues().min();
         let weakest = |of: &dyn Fn(&Measurement) -> bool| {

@@ -7,8 +7,8 @@
 use super::order::Elimination;
 use crate::estimate::solve::SolveError;
 
-/// Bytes that solving one component may take: its factor twice (as `H` and as the factor of it damped, or as the factor
-/// and the entries of `H⁻¹`), with the updates on the stack or the dense squares of the inverse. For whoever solves a
+/// Bytes that solving one component may take: its factor twice (the inverse is drawn from panels of its own, which may be
+/// as many), with the updates on the stack or what the inverse keeps and works on beside. For whoever solves a
 /// graph of his own; an agent, whose map others write, takes less ([`solve_map`](crate::estimate::solve_map)).
 pub const FACTOR_BYTES_MAX: u64 = 4 << 30;
 
@@ -24,15 +24,21 @@ pub(super) struct Needs {
     pub(super) updates: u64,
     /// Of the largest square and panel that the inverse takes beside.
     pub(super) inverse: u64,
+    /// Of the blocks of the inverse that are kept: at most those that `H` has.
+    pub(super) blocks: u64,
 }
 
 impl Needs {
-    /// What an elimination of variables of these sizes will take.
-    pub(super) fn of(elimination: &Elimination, sizes: &[usize]) -> Self {
+    /// What an elimination of variables of these sizes will take, given each one's neighbours of smaller index.
+    pub(super) fn of(elimination: &Elimination, sizes: &[usize], below: &[Vec<usize>]) -> Self {
         let Elimination { order, supernodes } = elimination;
         let scalars =
             |places: &mut dyn Iterator<Item = usize>| -> u64 { places.map(|place| sizes[order[place]] as u64).sum() };
         let mut needs = Self::default();
+        for (&size, neighbours) in sizes.iter().zip(below) {
+            let row = neighbours.iter().fold(size as u64, |sum, &other| sum.saturating_add(sizes[other] as u64));
+            needs.blocks = needs.blocks.saturating_add(row.saturating_mul(size as u64));
+        }
         let mut given = vec![0; supernodes.len()];
         let mut waiting = 0u64;
         for (k, node) in supernodes.iter().enumerate() {
@@ -52,7 +58,7 @@ impl Needs {
 
     /// Bytes in all, at most at a time.
     pub(super) fn bytes(self) -> u64 {
-        let beside = self.updates.max(self.inverse);
+        let beside = self.updates.max(self.inverse.saturating_add(self.blocks));
         bytes(self.values.saturating_mul(COPIES).saturating_add(beside))
     }
 }

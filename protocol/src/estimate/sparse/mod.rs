@@ -125,7 +125,7 @@ impl BlockPattern {
         let elimination = order::analyse(first, &below, bytes_max)?;
         let mut counts = [0; N];
         for (count, sizes) in counts.iter_mut().zip(sizes) {
-            let needs = Needs::of(&elimination, sizes);
+            let needs = Needs::of(&elimination, sizes, &below);
             memory::within(needs.bytes(), bytes_max)?;
             // What is within the limit of bytes can be counted.
             *count = usize::try_from(needs.updates).map_err(|_| SolveError::OutOfMemory)?;
@@ -231,6 +231,16 @@ impl Front {
             row += run.len();
         }
         row
+    }
+
+    /// Whether a scalar that is eliminated no earlier than the pivots is among the rows.
+    fn holds(&self, scalar: usize) -> bool {
+        self.pivots.contains(&scalar) || self.below.iter().any(|run| run.contains(&scalar))
+    }
+
+    /// Numbers of the panel.
+    fn value_count(&self) -> usize {
+        self.height * self.pivots.len()
     }
 
     /// Rows below the pivots.

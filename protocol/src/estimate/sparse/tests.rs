@@ -56,7 +56,9 @@ proptest! {
             let want = &inverse * b.rows(k * n, n);
             prop_assert!((DVector::from_column_slice(&x[k * n..(k + 1) * n]) - want).amax() < 1e-12);
         }
-        let selected = case.pattern.selected_inverse(&factor);
+        let all = (0..variables).flat_map(|a| (0..variables).map(move |b| (a, b)));
+        let selected = case.pattern.selected_inverse(&factor, all);
+        let diagonal = case.pattern.selected_inverse(&factor, []);
         for a in 0..variables {
             for b in 0..variables {
                 for (r, c) in (0..case.sizes[a]).flat_map(|r| (0..case.sizes[b]).map(move |c| (r, c))) {
@@ -64,6 +66,7 @@ proptest! {
                     let got = selected.get((a, r), (b, c));
                     prop_assert!(got.is_none_or(|got| (got - want).abs() < 1e-12));
                     prop_assert!(got.is_some() || a != b);
+                    prop_assert_eq!(diagonal.get((a, r), (b, c)), got.filter(|_| a == b));
                 }
             }
         }
@@ -146,7 +149,7 @@ fn a_factorisation_is_refused_from_the_first_byte_above_its_limit() {
     for seed in 0..50 {
         let (sizes, below) = pattern(seed);
         let pairs = || below.iter().enumerate().flat_map(|(a, list)| list.iter().map(move |&b| (a, b)));
-        let needs = Needs::of(&order::analyse(&sizes, &below, u64::MAX).unwrap(), &sizes);
+        let needs = Needs::of(&order::analyse(&sizes, &below, u64::MAX).unwrap(), &sizes, &below);
         let bytes = needs.bytes();
         let [at_limit] = BlockPattern::within([&sizes], pairs(), bytes).unwrap();
         assert_eq!(at_limit.value_count() as u64, needs.values);
@@ -177,7 +180,8 @@ fn updates_wait_in_just_the_memory_that_was_said() {
 
 #[test]
 fn counting_saturates() {
-    let two = order::analyse(&[usize::MAX >> 1, usize::MAX >> 1], &[vec![], vec![0]], u64::MAX).unwrap();
-    assert_eq!(Needs::of(&two, &[usize::MAX >> 1; 2]).bytes(), u64::MAX);
+    let (sizes, below) = ([usize::MAX >> 1; 2], [vec![], vec![0]]);
+    let two = order::analyse(&sizes, &below, u64::MAX).unwrap();
+    assert_eq!(Needs::of(&two, &sizes, &below).bytes(), u64::MAX);
     assert!(memory::within(u64::MAX, u64::MAX).is_ok() && memory::within(u64::MAX, FACTOR_BYTES_MAX).is_err());
 }

@@ -21,6 +21,9 @@ const ODOMETRY: (f64, f64) = (0.05, 0.005);
 const ALIGNMENT: (f64, f64) = (0.1, 0.01);
 const FRAME: (f64, f64) = (0.3, 0.02);
 
+/// Factors that an anchor brings at most: a step, and alignments with one of its own robot's and two of others'.
+const FACTORS_EACH: usize = 4;
+
 /// The swarm so far.
 pub(super) struct Swarm {
     dice: Dice,
@@ -56,7 +59,8 @@ impl Swarm {
             Robot { middle, poses: vec![first], steps: Vec::new() }
         };
         let robots: Vec<Robot> = (0..robots).map(robot).collect();
-        let mut swarm = Self { dice, robots, new_factors: Vec::new() };
+        let new_factors = Vec::with_capacity(FACTORS_EACH * robots.len() * anchors);
+        let mut swarm = Self { dice, robots, new_factors };
         for robot in 0..swarm.robots.len() {
             (1..anchors).for_each(|_| swarm.drive(robot));
             if robot > 0 {

@@ -89,7 +89,7 @@ impl Tally {
 
 /// Squares of the whitened residual, and the share of each direction's variance that the rest predicts.
 fn whitened(solution: &Solution, edge: &Edge, predicted: &Matrix6<f64>) -> Option<(Vector6<f64>, Vector6<f64>)> {
-    let Relative::Metric(p) = &edge.factor.t_i_j else { return None };
+    let Relative::Metric(p) = edge.t_i_j() else { return None };
     let residual = edge.residual(solution.values()).fixed_rows::<6>(0).into_owned();
     let l = p.covariance.matrix().cholesky()?.l();
     let j = l.solve_lower_triangular(&se3::right_jacobian_inv(&residual))?;

@@ -145,11 +145,12 @@ impl World<'_> {
         let mut worst: BTreeMap<(FrameId, FrameId), (f64, usize, f64)> = BTreeMap::new();
         for part in &self.parts {
             let inverse = part.solution.selected_inverse();
+            let nodes = part.solution.graph().nodes();
             for edge in part.solution.graph().edges() {
-                let Label::Alignment(entry) = edge.factor.label else { continue };
+                let Label::Alignment(entry) = edge.label else { continue };
                 let Some(out) = leave_one_out(&part.solution, &inverse, edge) else { continue };
                 let Some(limit) = out.dof.checked_sub(1).and_then(|k| CHI2_MAX.get(k)) else { continue };
-                let (i, j) = (edge.factor.i.frame, edge.factor.j.frame);
+                let (i, j) = (nodes[edge.i].frame, nodes[edge.j].frame);
                 // Chance is asked only where all of it can be judged, and of none that a robot found by itself.
                 let asked = out.dof == 6 && i != j;
                 let excess = out.chi2 / if asked { self.limit(part, out.log_sqrt_det) } else { *limit };
@@ -299,7 +300,7 @@ impl World<'_> {
         for part in &self.parts {
             volume = f64::max(volume, part.volume);
             let inverse = part.solution.selected_inverse();
-            for edge in part.solution.graph().edges().iter().filter(|e| e.factor.label != Label::Odometry) {
+            for edge in part.solution.graph().edges().iter().filter(|e| e.label != Label::Odometry) {
                 let judged = leave_one_out(&part.solution, &inverse, edge).filter(|out| out.dof == 6);
                 innovations.extend(judged.map(|out| (out.chi2, out.log_sqrt_det)));
             }
