@@ -87,7 +87,7 @@ pub(super) fn run(size: Size, seed: u64) -> anyhow::Result<(String, bool)> {
     bar.finish_and_clear();
     describe(&mut text, &additions, batch_s);
     if let Some(peak) = peak_mb() {
-        let _ = writeln!(text, "peak memory so far: {peak:.0} MB");
+        let _ = writeln!(text, "peak memory so far: {peak:.0} MB, {ALLOCATOR}");
     }
     let values: BTreeMap<SubmapId, Sim3> = grown.values().map(|(id, value)| (id, *value)).collect();
     let again = batch(driven_again(size, seed), &values)?;
@@ -181,9 +181,15 @@ fn quantile(values: impl Iterator<Item = f64>, share: f64) -> f64 {
     values.get(place.saturating_sub(1)).copied().unwrap_or(f64::NAN)
 }
 
-/// This process's memory at its largest, MB; `None` where the system does not tell. With it counts what the allocator
-/// keeps of freed memory: the simulator's keeps up to two thirds of what is held, the system's, which robots run with,
-/// a tenth.
+/// Whose memory is measured: an allocator keeps what was freed, the simulator's up to two thirds of what is held, the
+/// system's a tenth.
+const ALLOCATOR: &str = if cfg!(feature = "mimalloc") {
+    "much of it kept by the simulator's allocator (--no-default-features takes the system's, as robots do)"
+} else {
+    "with the system's allocator, as robots have it"
+};
+
+/// This process's memory at its largest, MB; `None` where the system does not tell.
 fn peak_mb() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
