@@ -1,4 +1,5 @@
 use super::*;
+use merganser_protocol::submap::{PlaceError, UpError};
 
 fn message() -> KeyframeMessage {
     let mut covariance = [0.0; 21];
