@@ -126,6 +126,18 @@ fn another_session_begins_an_epoch_at_once() {
     assert_eq!(begun(&wires), vec![EpochReason::Told]);
 }
 
+/// An old SLAM that is not dead yet beside the new one: of the old one all is refused, and the odometry of the new one has no
+/// holes by it.
+#[test]
+fn two_sessions_that_take_turns_begin_one_epoch() {
+    let of = |session: u64, keyframe: Keyframe| Keyframe { session: Some(session), ..keyframe };
+    let both = drive(0, 40).into_iter().enumerate().map(|(k, keyframe)| of(1 + k as u64 % 2, keyframe));
+    let wires = told(both.collect());
+    assert_eq!((wires.agents[0].status().epoch, begun(&wires)), (FIRST_EPOCH + 1, vec![EpochReason::Session]));
+    // The first of the old one was taken, and all of the new one.
+    assert_eq!((refusals(&wires), wires.agents[0].status().keyframes), (19, 21));
+}
+
 #[test]
 fn beyond_its_last_epoch_a_robot_that_restarts_is_only_refused() {
     let mut config = common::config();

@@ -135,7 +135,7 @@ impl Agent {
         self.close_submap();
         self.me.frame.epoch = epoch;
         self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
-        self.mapper.restart(&self.config.submap);
+        self.mapper.restart(reason == EpochReason::Session);
         self.event(Event::EpochBegan { frame: self.me.frame, reason });
         self.tell_of_limit();
     }

@@ -49,8 +49,8 @@ impl Mapper {
     }
 
     /// A new frame: what follows has nothing to do with what came before.
-    pub(super) fn restart(&mut self, config: &SubmapConfig) {
-        self.builder = SubmapBuilder::new(config.clone());
+    pub(super) fn restart(&mut self, session_is_over: bool) {
+        self.builder = self.builder.begun_anew(session_is_over);
         self.behind = None;
         (self.last, self.twist) = (None, None);
     }

@@ -104,6 +104,29 @@ fn live_poses_become_surer_and_not_surer_than_they_are() {
     assert!(together > 1.2 * independent, "{together} {independent}");
 }
 
+/// A hole in the odometry makes the last step unsure, not what the body did after its anchor the surer.
+#[test]
+fn a_gap_before_the_last_anchor_is_not_taken_for_its_walk() {
+    let (mut world, _) = world_of_walks(&mut rng(7));
+    let last = submap(1, ANCHORS - 1);
+    let walk = |world: &World| world.solve().ends(frame(0))[&last].walk;
+    let sound = walk(&world);
+    let steps = &mut world.problem.frames.get_mut(&frame(1)).unwrap().odometry;
+    let step = steps.last_mut().unwrap();
+    step.covariance = step.covariance.scaled(9.0);
+    assert_eq!(walk(&world), sound);
+    // The other way round, too.
+    let steps = &mut world.problem.frames.get_mut(&frame(1)).unwrap().odometry;
+    let [.., before, step] = steps.as_mut_slice() else { panic!("too few steps") };
+    core::mem::swap(&mut before.covariance, &mut step.covariance);
+    assert!(walk(&world).matrix().determinant() < 1.01 * sound.matrix().determinant());
+    // Of one step nobody knows whether it leads over a gap.
+    let chain = world.problem.frames.get_mut(&frame(1)).unwrap();
+    chain.odometry.truncate(2);
+    world.problem.alignments.retain(|a| [a.i, a.j].iter().all(|id| id.frame != frame(1) || id.index < 2));
+    assert!(!world.solve().ends(frame(0)).contains_key(&submap(1, 1)));
+}
+
 fn end(gain: f64) -> End {
     End { gain: Matrix6::identity() * gain, walk: sigmas(0.02, 0.005) }
 }

@@ -319,10 +319,12 @@ impl Chain {
         [to, from].into_iter().flatten().min_by(|a, b| volume(a).total_cmp(&volume(b)))
     }
 
-    /// The last anchor and the odometry's walk while its submap was made.
+    /// The last anchor and the odometry's walk while its submap was made: about that of the last step, or of the one before
+    /// it, of which one may lead over a gap. Of a single step nobody knows.
     pub(super) fn end(&self, frame: FrameId) -> Option<(SubmapId, Covariance<6>)> {
         let last = self.len().checked_sub(1)?;
-        Some((SubmapId { frame, index: u32::try_from(last).ok()? }, *self.walk(last)?))
+        let before = last.checked_sub(1).filter(|&before| before > 0)?;
+        Some((SubmapId { frame, index: u32::try_from(last).ok()? }, *self.walk(before)?))
     }
 
     /// Number of anchors.

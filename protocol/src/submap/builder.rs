@@ -21,6 +21,7 @@ use crate::config::{Gravity, Sensor, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
+use std::collections::VecDeque;
 
 /// Points in one keyframe at most: four times a dense depth image of 640×480.
 pub const POINTS_PER_KEYFRAME_MAX: usize = 1 << 20;
@@ -28,6 +29,8 @@ pub const POINTS_PER_KEYFRAME_MAX: usize = 1 << 20;
 pub const POSITION_MAX: f64 = 1e7;
 /// Stamps lie within this of the clock's zero, ns (146 years): the span of any two then fits the wire.
 pub const STAMP_MAX: i64 = (1 << 62) - 1;
+/// Runs of the front end remembered as over: a keyframe of one is refused and begins no epoch.
+pub const SESSIONS_OVER_MAX: usize = 8;
 /// Standard deviation (m and rad) of the first anchor in its frame: where the frame lies is a convention, so this is
 /// small, but not so small that it spoils the conditioning of an estimate.
 pub const FIRST_ANCHOR_SIGMA: f64 = 1e-4;
@@ -74,8 +77,10 @@ pub struct SubmapBuilder {
     gap: bool,
     /// Whether keyframes go on from one another.
     continuity: Continuity,
-    /// What the front end calls its run, if it said.
+    /// What the front end calls its run, if it said...
     session: Option<u64>,
+    /// ...and what it called the last runs that are over.
+    over: VecDeque<u64>,
     /// Where the body is: as the SLAM has it, or a laser's scans.
     t_frame_body: Se3,
     sharpener: Sharpener,
@@ -117,11 +122,24 @@ impl SubmapBuilder {
             gap: false,
             continuity: Continuity::default(),
             session: None,
+            over: VecDeque::new(),
             t_frame_body: Se3::identity(),
             sharpener: Sharpener::default(),
             misfits: Misfits::default(),
             misfit: None,
         }
+    }
+
+    /// A builder at the start of a new frame, which knows what runs of the front end are over: with `is_over` that of this
+    /// frame, too.
+    #[must_use]
+    pub fn begun_anew(&self, is_over: bool) -> Self {
+        let mut over = self.over.clone();
+        over.extend(self.session.filter(|_| is_over));
+        while over.len() > SESSIONS_OVER_MAX {
+            over.pop_front();
+        }
+        Self { over, ..Self::new(self.config.clone()) }
     }
 
     /// A builder that goes on after a restart of the agent (not of the SLAM): submaps below `next_index` exist, the
@@ -139,8 +157,8 @@ impl SubmapBuilder {
     /// [`KeyframeError`] if the keyframe is refused.
     pub fn push(&mut self, keyframe: Keyframe) -> Result<Option<Submap>, KeyframeError> {
         if let Err(error) = self.check(&keyframe) {
-            // A repeated or late keyframe is no loss; any other leaves a hole in the odometry.
-            self.gap |= !matches!(error, KeyframeError::StampNotRising { .. });
+            // A keyframe that is repeated, late or of another run is no loss; any other leaves a hole in the odometry.
+            self.gap |= !matches!(error, KeyframeError::StampNotRising { .. } | KeyframeError::SessionOver { .. });
             if matches!(error, KeyframeError::Jump { .. }) {
                 self.continuity.refuse(&keyframe, &self.config);
             }
@@ -199,6 +217,7 @@ impl SubmapBuilder {
     /// `session`, or it is the last that was wanted to be sure (see [`continuity`](super::continuity)). Then it is the
     /// first to [`push`](Self::push) to a new builder.
     pub fn another_frame(&self, keyframe: &Keyframe) -> Option<FrameSign> {
+        self.check_alone(keyframe).ok()?;
         let is_late = keyframe.stamp <= self.last.as_ref()?.stamp;
         match (self.session, keyframe.session) {
             // A session that is over may have keyframes on their way.
@@ -211,6 +230,19 @@ impl SubmapBuilder {
     fn check(&self, keyframe: &Keyframe) -> Result<(), KeyframeError> {
         if let Some(last) = self.last.as_ref().map(|k| k.stamp).filter(|&last| keyframe.stamp <= last) {
             return Err(KeyframeError::StampNotRising { stamp: keyframe.stamp.0, last: last.0 });
+        }
+        self.check_alone(keyframe)?;
+        let other = |place: &&PlaceDescriptor| self.open.as_ref().is_some_and(|open| !open.place.takes(place));
+        if let Some(place) = keyframe.place.as_ref().filter(other) {
+            return Err(KeyframeError::OtherPlace { numbers: place.vector().len(), model: place.model().into() });
+        }
+        self.continuity.check(keyframe, &self.config)
+    }
+
+    /// What no keyframe may be, whichever came before it.
+    fn check_alone(&self, keyframe: &Keyframe) -> Result<(), KeyframeError> {
+        if let Some(session) = keyframe.session.filter(|session| self.over.contains(session)) {
+            return Err(KeyframeError::SessionOver { session });
         }
         if !(-STAMP_MAX..=STAMP_MAX).contains(&keyframe.stamp.0) {
             return Err(KeyframeError::StampOutOfRange { stamp: keyframe.stamp.0 });
@@ -239,11 +271,7 @@ impl SubmapBuilder {
         if let Some(index) = keyframe.marks.iter().position(|mark| !in_range(mark)) {
             return Err(KeyframeError::MarkOutOfRange { index });
         }
-        let other = |place: &&PlaceDescriptor| self.open.as_ref().is_some_and(|open| !open.place.takes(place));
-        if let Some(place) = keyframe.place.as_ref().filter(other) {
-            return Err(KeyframeError::OtherPlace { numbers: place.vector().len(), model: place.model().into() });
-        }
-        self.continuity.check(keyframe, &self.config)
+        Ok(())
     }
 
     /// The motion since the last keyframe, if there was one.

@@ -1,7 +1,9 @@
+use super::super::builder::SESSIONS_OVER_MAX;
 use super::super::testing::keyframe;
 use super::super::{CovarianceOf, SubmapBuilder};
 use super::*;
 use crate::geometry::{Covariance, Se3, So3};
+use crate::time::Stamp;
 use nalgebra::Vector3;
 
 fn at(x: f64) -> Se3 {
@@ -219,6 +221,27 @@ fn a_session_says_it_at_once() {
     builder.push(of(Some(8), along(5, 6, 5.0)).remove(0)).unwrap();
     assert_eq!(builder.another_frame(&of(Some(7), along(5, 6, 0.0))[0]), None);
     assert_eq!(builder.another_frame(&of(Some(7), along(6, 7, 0.0))[0]), Some(FrameSign::Session));
+}
+
+#[test]
+fn sessions_that_are_over_stay_so_and_a_bad_keyframe_begins_none() {
+    let of = |session: u64| Keyframe { session: Some(session), ..along(1, 2, 1.0).remove(0) };
+    let over = |session: u64| Err(KeyframeError::SessionOver { session });
+    let mut builder = SubmapBuilder::new(SubmapConfig::default());
+    for session in 0..=SESSIONS_OVER_MAX as u64 {
+        builder.push(of(session)).unwrap();
+        let mut bad = Keyframe { stamp: Stamp(i64::MAX), ..of(session + 1) };
+        assert_eq!(builder.another_frame(&bad), None);
+        bad.stamp = of(0).stamp;
+        assert_eq!(builder.another_frame(&bad), Some(FrameSign::Session));
+        builder = builder.begun_anew(true);
+        assert_eq!((builder.another_frame(&of(session)), builder.push(of(session))), (None, over(session)));
+    }
+    // One more than are remembered were left.
+    assert_eq!(builder.push(of(1)), over(1));
+    assert!(builder.push(of(0)).is_ok());
+    // A frame that ended otherwise is of a session that goes on.
+    assert!(builder.begun_anew(false).push(of(0)).is_ok());
 }
 
 /// Poses that a loop closure corrected: a correction within a submap's length passes, with a covariance that knows nothing

@@ -68,8 +68,11 @@ pub struct Misfits {
 impl Misfits {
     /// Takes the misfit of a finished submap. The median of the last ones, once, when it is too large.
     pub fn take(&mut self, misfit: Option<f64>) -> Option<f64> {
+        if self.told {
+            return None;
+        }
         self.recent.extend(misfit);
-        if self.told || self.recent.len() < WINDOW {
+        if self.recent.len() < WINDOW {
             return None;
         }
         while self.recent.len() > WINDOW {

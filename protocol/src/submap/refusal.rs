@@ -5,8 +5,8 @@ use super::continuity::RESTART_KEYFRAMES;
 use super::planar::TILT_MAX;
 use thiserror::Error;
 
-/// Why a keyframe was refused. The builder is as it was before; only the odometry across the refused keyframe becomes
-/// less certain.
+/// Why a keyframe was refused. The submaps are as they were before; only the odometry across the refused keyframe becomes
+/// less certain, and several [jumps](Self::Jump) that go on from one another tell of a new frame.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum KeyframeError {
     /// The stamp is not after the last one.
@@ -16,6 +16,15 @@ pub enum KeyframeError {
         stamp: i64,
         /// The last accepted stamp, ns.
         last: i64,
+    },
+    /// Of a run of the front end after which another one began.
+    #[error(
+        "session {session} is over, another one has begun; stop the SLAM that still sends it, and let each start choose a \
+         number of its own"
+    )]
+    SessionOver {
+        /// What the run calls itself.
+        session: u64,
     },
     /// The stamp is farther than [`STAMP_MAX`](super::builder::STAMP_MAX) from the clock's zero.
     #[error("keyframe stamp {stamp} ns is more than 146 years from zero; send nanoseconds")]

@@ -43,13 +43,18 @@ fn rows(part: &Part) -> impl Iterator<Item = Marginal> {
 }
 
 fn g2o_text(graph: &PoseGraph, parts: &[Part], keep: impl Fn(usize) -> bool) -> String {
-    let empty = || PoseGraph { planar: graph.planar, fixed: graph.fixed.clone(), ..PoseGraph::default() };
+    let empty = || PoseGraph { planar: graph.planar, ..PoseGraph::default() };
     let part_of: BTreeMap<u64, usize> =
         parts.iter().enumerate().flat_map(|(k, part)| part.poses.keys().map(move |&id| (id, k))).collect();
     // What is left over comes last: measurements of poses for which no place was found.
     let mut graphs: Vec<PoseGraph> = (0..=parts.len()).map(|_| empty()).collect();
     for (graph, part) in graphs.iter_mut().zip(parts) {
         graph.poses = part.poses.iter().map(|(&id, &value)| (id, Some(value))).collect();
+    }
+    for &id in &graph.fixed {
+        if let Some(&k) = part_of.get(&id) {
+            graphs[k].fixed.insert(id);
+        }
     }
     for (_, m) in graph.measurements.iter().enumerate().filter(|(k, _)| keep(*k)) {
         graphs[part_of.get(&m.i).copied().unwrap_or(parts.len())].measurements.push(m.clone());

@@ -9,8 +9,10 @@ use super::lines::{Files, without_mark};
 use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_weights, printed_matrix};
 use crate::geometry::so3::So3;
 use crate::geometry::{Se3, se3};
+use crate::ids::Hash;
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fmt::Write;
 use thiserror::Error;
 
@@ -104,8 +106,8 @@ pub struct Parser {
     files: Files,
     /// Measurements of the files before this one.
     earlier: usize,
-    /// The first of the measurements that are equal, by their ends.
-    between: BTreeMap<(u64, u64), Vec<usize>>,
+    /// The first of the measurements that are equal, by their [`digest`].
+    seen: BTreeMap<[u8; 16], usize>,
     repeated: Option<Repeated>,
     planar: Option<bool>,
 }
@@ -157,7 +159,11 @@ impl Parser {
             _ if tag.starts_with('#') || tag.starts_with("PARAMS_") => Ok(()),
             "FIX" => {
                 let ids = fields.iter().map(|text| text.parse().map_err(|_| Fault::Id(cut(text))));
-                self.graph.fixed.extend(ids.collect::<Result<Vec<u64>, Fault>>()?);
+                let ids = ids.collect::<Result<Vec<u64>, Fault>>()?;
+                if self.graph.fixed.len() + ids.len() > POSES_MAX {
+                    return Err(Fault::Poses);
+                }
+                self.graph.fixed.extend(ids);
                 Ok(())
             }
             "VERTEX_SE3:QUAT" => {
@@ -214,12 +220,11 @@ impl Parser {
         self.room_for(&[i, j])?;
         self.graph.poses.entry(i).or_default();
         self.graph.poses.entry(j).or_default();
-        let (known, line) = (self.between.entry((i, j)).or_default(), self.files.last());
-        let of = |k: usize| (&self.graph.measurements[k].t_i_j, &self.graph.measurements[k].information);
-        match known.iter().copied().find(|&k| of(k) == (&t_i_j, &information)) {
-            Some(k) if k < self.earlier => return Ok(()),
-            Some(_) => self.repeated.get_or_insert(Repeated { count: 0, line }).count += 1,
-            None => known.push(self.graph.measurements.len()),
+        let (seen, line) = (self.seen.entry(digest([i, j], &t_i_j, &information)), self.files.last());
+        match seen {
+            Entry::Occupied(first) if *first.get() < self.earlier => return Ok(()),
+            Entry::Occupied(_) => self.repeated.get_or_insert(Repeated { count: 0, line }).count += 1,
+            Entry::Vacant(first) => _ = first.insert(self.graph.measurements.len()),
         }
         self.graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
         Ok(())
@@ -233,6 +238,20 @@ impl Parser {
         let new = ids.iter().filter(|id| !self.graph.poses.contains_key(id)).count();
         if self.graph.poses.len() + new > POSES_MAX { Err(Fault::Poses) } else { Ok(()) }
     }
+}
+
+/// What tells a measurement from others: half a BLAKE3 hash of its ends and numbers. A file may hold any number between the
+/// same two poses.
+fn digest(ends: [u64; 2], t_i_j: &Se3, information: &Matrix6<f64>) -> [u8; 16] {
+    let (at, turn) = (t_i_j.translation, t_i_j.rotation.xyzw());
+    let numbers = at.iter().chain(&turn).chain(information).copied();
+    let mut bytes: Vec<u8> = ends.into_iter().flat_map(u64::to_le_bytes).collect();
+    // A negative zero equals zero.
+    for number in numbers.map(|number: f64| number + 0.0) {
+        bytes.extend(number.to_le_bytes());
+    }
+    let Hash(hash) = Hash::of(&bytes);
+    core::array::from_fn(|k| hash[k])
 }
 
 /// Ids, then numbers.

@@ -239,6 +239,10 @@ fn faults_name_their_line_and_what_to_do() {
     assert!(indefinite.isotropic().solve(&start, 10).is_ok());
     assert_eq!(fault("VERTEX_SE2 0 1 -2e12 3"), Fault::Far(-2e12));
     assert_eq!(fault("FIX 0 one"), Fault::Id("one".into()));
+    // As many poses may be fixed as there may be.
+    let mut parser = Parser::default();
+    (0..POSES_MAX as u64).for_each(|id| parser.line(&format!("FIX {id}")).unwrap());
+    assert_eq!(parser.line("FIX 1000000").unwrap_err().what, Fault::Poses);
     assert_eq!(fault("VERTEX_SE2 0 0 0 0\rVERTEX_SE2 1 0 0 0\r"), Fault::CarriageReturn);
     assert_eq!(fault("\u{fffd}\u{fffd}V\0E\0"), Fault::Text);
     assert!(parsed(&format!("\u{feff}{good}\r\n")).is_ok());

@@ -15,6 +15,8 @@ use std::collections::{BTreeMap, BTreeSet};
 const CLOSURES_MIN: usize = 2;
 /// Fewest pairs of parts whose closures cross a cut.
 const PAIRS_MIN: usize = 2;
+/// Parts tied together at most: of more, each of which few closures tie, nobody says in time what belongs together.
+const CLUSTER_MAX: usize = 256;
 /// log10 of the false alarms of a merge that is only tried: what a cluster rests on are its cuts.
 const LOG10_NFA_MAX: f64 = -1.5;
 
@@ -27,23 +29,30 @@ impl World<'_> {
         let part_of: BTreeMap<FrameId, usize> =
             self.parts.iter().enumerate().flat_map(|(k, p)| p.frames.iter().map(move |&f| (f, k))).collect();
         let mut trial = self.clone();
-        for _ in 0..self.parts.len() {
+        if !trial.merge_on(CLOSURES_MIN, LOG10_NFA_MAX) {
+            return false;
+        }
+        trial.settle();
+        for _ in 1..self.parts.len() {
             if !trial.merge_on(CLOSURES_MIN, LOG10_NFA_MAX) {
                 break;
             }
             trial.settle();
         }
+        // Frames that could not be solved are in no part.
         let ends = |k: usize| {
             let c = &trial.closures[k];
-            (part_of[&c.i.frame], part_of[&c.j.frame])
+            Some((*part_of.get(&c.i.frame)?, *part_of.get(&c.j.frame)?))
         };
-        let fresh = |k: &usize| trial.closures[*k].is_used() && ends(*k).0 != ends(*k).1;
-        let ties: Vec<usize> = (0..trial.closures.len()).filter(fresh).collect();
-        let all = (0..self.parts.len()).collect();
-        let clusters = clusters(all, &ties.iter().map(|&k| ends(k)).collect::<Vec<_>>(), self.config.alignments_min);
+        let used = (0..trial.closures.len()).filter(|&k| trial.closures[k].is_used());
+        let ties: Vec<(usize, (usize, usize))> =
+            used.filter_map(|k| Some((k, ends(k)?))).filter(|(_, (a, b))| a != b).collect();
+        let pairs: Vec<(usize, usize)> = ties.iter().map(|&(_, ends)| ends).collect();
+        let tied = tied_together(&pairs).into_iter().filter(|parts| parts.len() <= CLUSTER_MAX);
+        let clusters = tied.flat_map(|parts| clusters(parts, &pairs, self.config.alignments_min));
         let mut any = false;
-        for cluster in clusters.iter().filter(|c| c.len() > 1) {
-            for &k in ties.iter().filter(|&&k| cluster.contains(&ends(k).0) && cluster.contains(&ends(k).1)) {
+        for cluster in clusters.filter(|c| c.len() > 1) {
+            for &(k, _) in ties.iter().filter(|(_, (a, b))| cluster.contains(a) && cluster.contains(b)) {
                 self.closures[k].unused = None;
                 any = true;
             }
@@ -57,6 +66,27 @@ impl World<'_> {
         }
         any
     }
+}
+
+/// The nodes that ties connect, each with all that it is connected to.
+fn tied_together(ties: &[(usize, usize)]) -> Vec<BTreeSet<usize>> {
+    let mut neighbours: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
+    for &(a, b) in ties {
+        neighbours.entry(a).or_default().insert(b);
+        neighbours.entry(b).or_default().insert(a);
+    }
+    let mut components = Vec::new();
+    while let Some((&first, _)) = neighbours.first_key_value() {
+        let (mut component, mut waiting) = (BTreeSet::new(), vec![first]);
+        while let Some(node) = waiting.pop() {
+            if let Some(next) = neighbours.remove(&node) {
+                component.insert(node);
+                waiting.extend(next);
+            }
+        }
+        components.push(component);
+    }
+    components
 }
 
 /// Divides nodes along cuts that fewer than `least` ties cross, or those of fewer than [`PAIRS_MIN`] pairs, until no such
@@ -92,10 +122,11 @@ fn smallest_cut(nodes: &BTreeSet<usize>, ties: &[(usize, usize)]) -> Option<(usi
     while left.len() > 1 {
         // Most tightly tied first; the last is cut off by all its ties.
         let mut order: Vec<usize> = Vec::with_capacity(left.len());
-        let mut tied = vec![0_usize; groups.len()];
+        let (mut tied, mut is_in) = (vec![0_usize; groups.len()], vec![false; groups.len()]);
         while order.len() < left.len() {
-            let next = left.iter().copied().filter(|v| !order.contains(v)).max_by_key(|&v| (tied[v], v))?;
+            let next = left.iter().copied().filter(|&v| !is_in[v]).max_by_key(|&v| (tied[v], v))?;
             order.push(next);
+            is_in[next] = true;
             left.iter().for_each(|&v| tied[v] += weight[next][v]);
         }
         let (last, before) = (order[order.len() - 1], order[order.len() - 2]);
@@ -136,5 +167,19 @@ mod tests {
         assert_eq!(parts, [BTreeSet::from([0, 1, 2]), BTreeSet::from([3, 4, 5]), BTreeSet::from([6])]);
         assert_eq!(clusters(nodes(6), &ties, 2), [nodes(6)]);
         assert_eq!(clusters(nodes(2), &[(0, 1); 5], 3).len(), 2, "a pair by itself");
+    }
+
+    #[test]
+    fn only_what_is_tied_is_looked_at_together() {
+        let pairs: Vec<(usize, usize)> = (0..50_000).map(|k| (2 * k, 2 * k + 1)).collect();
+        let components = tied_together(&pairs);
+        assert!(components.len() == 50_000 && components.iter().all(|c| c.len() == 2));
+        let mut ring: Vec<(usize, usize)> = (0..CLUSTER_MAX).map(|k| (k, (k + 1) % CLUSTER_MAX)).collect();
+        assert_eq!(tied_together(&ring), [(0..CLUSTER_MAX).collect()]);
+        // The largest that is divided: a ring of single ties falls apart, of double ones it holds.
+        assert_eq!(clusters((0..CLUSTER_MAX).collect(), &ring, 3).len(), CLUSTER_MAX);
+        ring.extend(ring.clone());
+        assert_eq!(clusters((0..CLUSTER_MAX).collect(), &ring, 3).len(), 1);
+        assert!(tied_together(&[]).is_empty());
     }
 }
