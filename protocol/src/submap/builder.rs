@@ -217,11 +217,13 @@ impl SubmapBuilder {
     /// `session`, or it is the last that was wanted to be sure (see [`continuity`](super::continuity)). Then it is the
     /// first to [`push`](Self::push) to a new builder.
     pub fn another_frame(&self, keyframe: &Keyframe) -> Option<FrameSign> {
-        self.check_alone(keyframe).ok()?;
         let is_late = keyframe.stamp <= self.last.as_ref()?.stamp;
         match (self.session, keyframe.session) {
             // A session that is over may have keyframes on their way.
-            (Some(before), Some(now)) if now != before => (now > before || !is_late).then_some(FrameSign::Session),
+            (Some(before), Some(now)) if now != before => {
+                let begins = (now > before || !is_late) && self.check_alone(keyframe).is_ok();
+                begins.then_some(FrameSign::Session)
+            }
             _ if is_late || !self.continuity.is_restart(keyframe, &self.config) => None,
             _ => matches!(self.check(keyframe), Err(KeyframeError::Jump { .. })).then_some(FrameSign::Jump),
         }

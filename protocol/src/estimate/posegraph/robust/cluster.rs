@@ -29,15 +29,13 @@ impl World<'_> {
         let part_of: BTreeMap<FrameId, usize> =
             self.parts.iter().enumerate().flat_map(|(k, p)| p.frames.iter().map(move |&f| (f, k))).collect();
         let mut trial = self.clone();
-        if !trial.merge_on(CLOSURES_MIN, LOG10_NFA_MAX) {
-            return false;
-        }
-        trial.settle();
-        for _ in 1..self.parts.len() {
-            if !trial.merge_on(CLOSURES_MIN, LOG10_NFA_MAX) {
-                break;
-            }
+        let mut merges = 0;
+        while merges < self.parts.len() && trial.merge_on(CLOSURES_MIN, LOG10_NFA_MAX) {
             trial.settle();
+            merges += 1;
+        }
+        if merges == 0 {
+            return false;
         }
         // Frames that could not be solved are in no part.
         let ends = |k: usize| {
