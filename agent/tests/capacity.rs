@@ -8,6 +8,7 @@
 mod common;
 
 use common::{PATIENCE, name, until};
+use core::num::NonZero;
 use ed25519_dalek::SigningKey;
 use merganser::config::FileConfig;
 use merganser::link::session::{self, Role};
@@ -146,6 +147,7 @@ fn submap(index: u32) -> Fact {
         keypoint_count: 384,
         blob: Hash::of(&index.to_le_bytes()),
         scale: ScaleKind::Metric,
+        keyframes: NonZero::new(4),
     })
 }
 

@@ -76,7 +76,7 @@ fn frames_are_never_merged_wrongly_nor_claimed_better_than_known() {
 /// skewed, neither the mean nor its error says much).
 #[test]
 fn frames_submaps_and_live_poses_are_as_uncertain_as_they_say() {
-    let means = measure(World::Lidar, 1..61, || {}).unwrap();
+    let means = measure(World::Lidar, None, 1..61, || {}).unwrap();
     println!("frames, submaps, live poses: {:?}", means.of);
     assert_eq!((means.swarms, means.condensed), (60, 60));
     for mean in means.of {

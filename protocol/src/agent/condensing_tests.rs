@@ -21,7 +21,11 @@ const ALIGNMENTS: usize = 5;
 const RUNS: u64 = 600;
 
 /// What the robots of a world wrote, by frame.
-struct Logs(BTreeMap<FrameId, Vec<Fact>>);
+struct Logs {
+    facts: BTreeMap<FrameId, Vec<Fact>>,
+    /// Whether alignments have anything in common, so that clouds are bent.
+    bent: bool,
+}
 
 impl Logs {
     fn of(world: &World) -> Self {
@@ -46,17 +50,17 @@ impl Logs {
         verdicts.into_iter().for_each(|(frame, verdict)| logs.get_mut(&frame).unwrap().push(verdict));
         // As everybody reads them, so that what condensing changes is told from what the wire does.
         logs.values_mut().flatten().for_each(|fact| *fact = as_read(fact));
-        Self(logs)
+        Self { facts: logs, bent: true }
     }
 
     fn entries(&self, frame: FrameId) -> Vec<Entry> {
-        let facts = self.0[&frame].iter();
+        let facts = self.facts[&frame].iter();
         (0..).zip(facts).map(|(seq, fact)| entry(seq, 0, fact)).collect()
     }
 
     fn knowledge(&self) -> Knowledge {
         let mut knowledge = Knowledge::default();
-        for (frame, facts) in &self.0 {
+        for (frame, facts) in &self.facts {
             for (seq, fact) in (0..).zip(facts) {
                 knowledge.absorb(EntryId { frame: *frame, seq }, fact.clone());
             }
@@ -76,7 +80,7 @@ impl Logs {
 
     fn condensed(&self, knowledge: &Knowledge) -> (Knowledge, BTreeMap<EntryId, Fact>) {
         let (mut condensed, mut held) = (Knowledge::default(), BTreeMap::new());
-        for (frame, facts) in &self.0 {
+        for (frame, facts) in &self.facts {
             for (seq, part) in (facts.len() as u32..).zip(self.shorter(*frame, knowledge).parts) {
                 let fact = as_read(&Fact::Condensed(part));
                 condensed.absorb(EntryId { frame: *frame, seq }, fact.clone());
@@ -93,11 +97,14 @@ impl Logs {
                 Some(Fact::Condensed(fact)) => {
                     &fact.carried.iter().find(|one| one.seq == known.entry.seq).unwrap().fact
                 }
-                _ => &self.0[&known.entry.frame][known.entry.seq as usize],
+                _ => &self.facts[&known.entry.frame][known.entry.seq as usize],
             };
             if let Fact::Submap(fact) = fact { Some(fact.odometry) } else { None }
         };
-        let question = knowledge.question(own, odometry);
+        let mut question = knowledge.question(own, odometry);
+        if !self.bent {
+            question.problem.common.clear();
+        }
         (solve_map(&question.problem, &EstimateConfig::default()), question.gaps)
     }
 }
@@ -134,6 +141,7 @@ fn submap(index: u32, odometry: PoseWithCovariance) -> Fact {
         keypoint_count: 1,
         blob: Hash::of(&index.to_le_bytes()),
         scale: ScaleKind::Metric,
+        keyframes: None,
     })
 }
 
@@ -201,20 +209,21 @@ fn the_estimate_of_a_condensed_log_is_honest() {
         assert!((0.93..=1.07).contains(&anees), "{anees}");
     }
     // Compounding itself is exact (the next test). Here the odometry is linearised where it was measured, and in the whole
-    // graph where the loops move it to: by so much the two differ, to either side.
-    assert!(ratios[0] > 0.999 && least > 0.995, "surer than before: {}, {least}", ratios[0]);
+    // graph where the loops move it to; and by how much the odometry of one submap bent its cloud is told by its share of a
+    // compounded step, whose rotations have longer levers: by so much the two differ, to either side.
+    assert!(ratios[0] > 0.999 && least > 0.98, "surer than before: {}, {least}", ratios[0]);
     assert!(shifts[shifts.len() - 1] < 0.3, "{}", shifts[shifts.len() - 1]);
 }
 
 /// Where the measurements agree, so that whole and condensed graph are linearised at one place, no direction of any
-/// relation is surer than before, but for the floor that the graph puts below every factor (1.2e-8), and for rounding.
+/// relation is surer than before, where no cloud is bent, but for the floor that the graph puts below every factor (1.2e-8), and for rounding.
 #[test]
 fn a_condensed_log_is_never_surer_than_what_it_replaces() {
     let (mut compounded, mut written) = ([f64::INFINITY, 0.0], [f64::INFINITY, 0.0f64]);
     let widen = |range: &mut [f64; 2], [least, most]: [f64; 2]| *range = [range[0].min(least), range[1].max(most)];
     for seed in 0..20 {
         let (world, [a, b]) = world_with_noise(seed, false);
-        let logs = Logs::of(&world);
+        let logs = Logs { bent: false, ..Logs::of(&world) };
         let knowledge = logs.knowledge();
         let kept: Gaps = [a, b].map(|frame| (frame, logs.kept(frame, &knowledge))).into();
         assert!(kept.values().all(|kept| kept.len() < ANCHORS - 5));
@@ -277,7 +286,7 @@ fn what_stays_is_what_is_tied_and_enough_of_the_rest() {
         assert!(kept[0] == 0 && kept.contains(&(ANCHORS as u32 - 1)));
         assert!(tied.iter().filter(|id| id.frame == frame).all(|id| kept.contains(&id.index)));
         assert!(kept.windows(2).all(|two| two[1] - two[0] <= GONE_IN_A_ROW_MAX + 1), "{kept:?}");
-        let others = logs.0[&frame].len() - ANCHORS;
+        let others = logs.facts[&frame].len() - ANCHORS;
         assert_eq!(carried.len() - kept.len(), others, "every other fact is carried");
         // Each submap says which one it follows now.
         let after: Vec<_> = carried.iter().filter(|one| one.fact.kind() == 1).map(|one| one.after).collect();

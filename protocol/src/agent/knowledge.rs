@@ -13,6 +13,7 @@ use crate::wire::fact::{
     AlignmentFact, CarriedFact, Fact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact,
     VerdictOutcome,
 };
+use core::num::NonZero;
 use nalgebra::Vector3;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -55,6 +56,8 @@ pub struct Known {
     pub blob: Hash,
     /// Unit of the frame.
     pub scale: ScaleKind,
+    /// How many keyframes made it, if that is told.
+    pub keyframes: Option<NonZero<u16>>,
     /// What it looks like, if that can be read.
     pub summary: Option<Summary>,
 }
@@ -164,6 +167,7 @@ impl Knowledge {
                 extent: fact.extent,
                 blob: fact.blob,
                 scale: fact.scale,
+                keyframes: fact.keyframes,
                 summary: Summary::decode(&fact.summary).ok(),
             };
             self.submaps.insert(submap, Box::new(known));
@@ -298,13 +302,25 @@ impl Knowledge {
             let scale = anchors.peek()?.scale;
             Some((*frame, FrameChain { scale, odometry: anchors.map_while(&mut odometry).collect() }))
         };
-        let frames = tied.iter().filter_map(&mut chain).collect();
+        let frames: BTreeMap<_, _> = tied.iter().filter_map(&mut chain).collect();
+        let within = self.submaps.iter().filter(|(id, _)| frames.contains_key(&id.frame));
+        let keyframes = within.filter_map(|(id, known)| Some((place(*id)?, known.keyframes?))).collect();
+        let gone = chains.iter().filter(|(frame, _)| frames.contains_key(frame)).flat_map(gone_before).collect();
         let (posed, alone): (BTreeMap<_, _>, BTreeMap<_, _>) =
             chains.into_iter().partition(|(frame, _)| tied.contains(frame));
         let gaps =
             posed.into_iter().filter(|(_, chain)| chain.last().is_some_and(|last| *last as usize >= chain.len()));
         Question {
-            problem: MapProblem { frames, alignments, sightings, positions, common, ambiguous: self.ambiguous() },
+            problem: MapProblem {
+                gone,
+                keyframes,
+                frames,
+                alignments,
+                sightings,
+                positions,
+                common,
+                ambiguous: self.ambiguous(),
+            },
             alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
             gaps: gaps.collect(),
         }
@@ -362,6 +378,15 @@ impl Knowledge {
 /// Whether the observer says where another robot is, and nobody else does.
 fn is_of_another(id: EntryId, i: SubmapId, j: SubmapId) -> bool {
     i.frame.robot == id.frame.robot && j.frame.robot != id.frame.robot
+}
+
+/// Of the submaps of a chain that others are gone before: their place, and how many.
+fn gone_before((frame, chain): (&FrameId, &Vec<u32>)) -> Vec<(SubmapId, u32)> {
+    let one = |(place, two): (u32, &[u32])| {
+        let gone = two[1].saturating_sub(two[0]).saturating_sub(1);
+        (gone > 0).then_some((SubmapId { frame: *frame, index: place }, gone))
+    };
+    (1..).zip(chain.windows(2)).filter_map(one).collect()
 }
 
 #[cfg(test)]

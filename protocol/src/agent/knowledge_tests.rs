@@ -32,6 +32,7 @@ fn submap() -> Fact {
         keypoint_count: 1,
         blob: Hash::default(),
         scale: ScaleKind::Metric,
+        keyframes: None,
     })
 }
 

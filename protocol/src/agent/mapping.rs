@@ -11,6 +11,7 @@ use crate::submap::continuity::FrameSign;
 use crate::submap::{Described, Features, Keyframe, KeyframeError, Keypoints, Submap, SubmapBuilder};
 use crate::time::{Instant, Stamp};
 use crate::wire::fact::{Fact, SubmapFact};
+use core::num::NonZero;
 use core::time::Duration;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -167,6 +168,7 @@ impl Agent {
             keypoint_count: u16::try_from(described.keypoints.len()).unwrap_or(u16::MAX),
             blob: hash,
             scale: self.config.submap.scale,
+            keyframes: u16::try_from(submap.keyframes.len()).ok().and_then(NonZero::new),
         });
         if !self.write(id.frame.epoch, &fact) {
             return;

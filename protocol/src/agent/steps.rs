@@ -60,6 +60,7 @@ mod tests {
             after: None,
             stamps: [Stamp(0); 2],
             t_prev_this: Se3::identity(),
+            keyframes: None,
             extent: [1.0; 3],
             blob: Hash::default(),
             scale: ScaleKind::Metric,

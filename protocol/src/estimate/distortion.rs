@@ -18,15 +18,13 @@
 //! charged in full 7.6. Over 2,670 pairs of alignments of one ray-cast LiDAR submap: their errors correlate by 0.14 and 0.21
 //! (translation, rotation).
 //!
-//! Odometry that drifts bends the cloud, too: its middle lies off its anchor, the middle keyframe, by a twelfth of the
-//! variance of the walk while it was made ([`builder`](crate::submap::builder)). So much is added to `C_k`. *Measured* in
-//! swarms of stand-in clouds that drift so (`merganser-sim bench calibration`): without it the submaps' NEES is 1.18 by
-//! degrees of freedom. That this error goes with that of the odometry on either side is left out here: a factor of three
-//! nodes would be needed to tell the graph. It is not cautious everywhere. Worked out for one axis of a chain of twelve
-//! submaps of four keyframes, each aligned one to four times with what is known (true variance over the claimed one):
-//! anchors amid the chain 1.07 to 1.16, the last one 0.86 to 1.02, the body beyond it 0.69 to 0.91. Of the body
-//! [`ends`](super::ends) knows better.
+//! Odometry that drifts bends the cloud, too: its middle lies off its anchor, the middle keyframe, by about a twelfth of
+//! the variance of the walk while it was made ([`walk`](super::walk)). So much is added to `C_k`. *Measured* in swarms of stand-in clouds
+//! that drift so (`merganser-sim bench calibration`): without it the submaps' NEES is 1.18 by degrees of freedom. What goes
+//! with the odometry on either side is told to the graph by [`bend`](super::bend), and to who goes on from the map by
+//! [`ends`](super::ends).
 
+use super::bend::{self, Around, Gains};
 use super::graph::{Factor, Label};
 use super::intake::Kind;
 use super::joint::EdgeEstimate;
@@ -42,9 +40,6 @@ pub const COMMON_MAX: f64 = 0.45;
 pub const COMMON_BENT: f64 = COMMON_MAX;
 /// That of submaps that a LiDAR saw, which bends nothing: the noise of their own points.
 pub const COMMON_LIDAR: f64 = 0.2;
-
-/// Variance of where the middle of a random walk's points lies, by the walk's middle point, per variance of the walk.
-const DRIFT_SHARE: f64 = 1.0 / 12.0;
 
 /// Marks the node of a submap's cloud; no frame has so many submaps.
 const CLOUD: u32 = 1 << 31;
@@ -103,17 +98,19 @@ pub(super) fn charge(edges: &mut [EdgeEstimate]) {
     }
 }
 
-/// The factors of measurements that count, and of the clouds that they tie; `walk` says by how much odometry drifted while
-/// a submap was made.
+/// The factors of measurements that count, and of the clouds that they tie, and what these owe to the odometry around them.
 pub(super) fn factors<'a>(
     edges: &[&EdgeEstimate],
-    walk: impl Fn(SubmapId) -> Option<&'a Covariance<6>>,
-) -> Vec<Factor> {
+    odometry: impl Fn(SubmapId) -> Option<Around<'a>>,
+) -> (Vec<Factor>, BTreeMap<SubmapId, Gains>) {
     let shared: Vec<Option<Shared>> = edges.iter().map(|edge| Shared::of(edge)).collect();
     let clouds = clouds(edges, &shared);
+    let mut gains = BTreeMap::new();
     let cloud = |(id, common): (&SubmapId, &Covariance<6>)| {
-        let drift = walk(*id).map(|walk| walk.scaled(DRIFT_SHARE));
-        cloud_factor(*id, &drift.map_or(*common, |drift| common.plus(&drift)))
+        let (covariance, of_steps) =
+            odometry(*id).map_or((*common, [None; 2]), |around| bend::owed(common, &around.walk, around.steps));
+        gains.insert(*id, of_steps);
+        cloud_factor(*id, &covariance)
     };
     let mut factors: Vec<Factor> = clouds.iter().map(cloud).collect();
     let one = |(edge, shared): (&&EdgeEstimate, &Option<Shared>)| match shared {
@@ -121,7 +118,7 @@ pub(super) fn factors<'a>(
         Some(shared) => shared.factor(edge.factor(), &clouds),
     };
     factors.extend(edges.iter().zip(&shared).map(one));
-    factors
+    (factors, gains)
 }
 
 /// How a cloud lies by its anchor.

@@ -1,7 +1,9 @@
 use super::*;
 use crate::estimate::joint::{AgreedAlignment, JointEstimate};
 use crate::estimate::test_graphs::{frame, normal, rng, submap};
-use crate::estimate::test_world::{ALIGNMENT, ODOMETRY, World, bits, rigid};
+use crate::estimate::test_walks::{Walked, walked};
+use crate::estimate::test_world::{ALIGNMENT, World, bits, rigid};
+use crate::estimate::walk::Walk;
 use crate::geometry::{Se3, SimWithCovariance};
 use crate::ids::EntryId;
 use nalgebra::{DMatrix, Vector6};
@@ -14,23 +16,20 @@ fn sigmas() -> Vector6<f64> {
 }
 
 /// Three robots side by side, many submaps of any two of them aligned, with errors that come from the submaps to twice the
-/// share `common`, stated as large as they are, and of clouds that odometry bent.
+/// share `common`, stated as large as they are, and of clouds that their odometry bent.
 fn bent_world(rng: &mut ChaCha8Rng, common: f64) -> World {
     const ANCHORS: u32 = 8;
-    let mut world = World::new(rng, 3, ANCHORS as usize, false);
+    let Walked { mut world, clouds, .. } = walked(rng, 3, ANCHORS as usize, 5);
     let noise =
         |rng: &mut ChaCha8Rng, share: f64| Se3::exp(&Vector6::from_fn(|k, _| sigmas()[k] * share.sqrt() * normal(rng)));
-    let drift = |rng: &mut ChaCha8Rng| {
-        let sigma = |k: usize| if k < 3 { ODOMETRY.0 } else { ODOMETRY.1 };
-        Se3::exp(&Vector6::from_fn(|k, _| sigma(k) * DRIFT_SHARE.sqrt() * normal(rng)))
-    };
-    let bent: BTreeMap<SubmapId, Se3> = world.truth.keys().map(|id| (*id, drift(rng) * noise(rng, common))).collect();
+    let bent: BTreeMap<SubmapId, Se3> =
+        clouds.into_iter().map(|(id, cloud)| (id, cloud * noise(rng, common))).collect();
     let variance = Matrix6::from_diagonal(&sigmas().component_mul(&sigmas()));
     for (a, b) in [(0, 1), (0, 2), (1, 2)] {
         for (k, l) in (0..ANCHORS).flat_map(|k| [0, 1, 3].map(|gap| (k, (k + gap) % ANCHORS))) {
             let (i, j) = (submap(a, k as usize), submap(b, l as usize));
             let truth = world.truth[&i].inverse() * world.truth[&j];
-            let pose = bent[&i].inverse() * truth * bent[&j] * noise(rng, 1.0 - 2.0 * common);
+            let pose = bent[&i].inverse() * bent[&j] * noise(rng, 1.0 - 2.0 * common);
             let lever = truth.inverse().adjoint();
             let covariance = lever * variance * lever.transpose() * common + variance * (1.0 - common);
             let covariance = Covariance::new(covariance).unwrap();
@@ -106,7 +105,7 @@ fn a_single_alignment_of_a_submap_is_left_as_it_is() {
     let all: Vec<EdgeEstimate> =
         (0..3).map(|k| edge(k, submap(1, k as usize), submap(2, k as usize), pose(rng, 0.01), 0.4)).collect();
     let all: Vec<&EdgeEstimate> = all.iter().collect();
-    assert_eq!(factors(&all, |_| None), all.iter().map(|edge| edge.factor()).collect::<Vec<_>>());
+    assert_eq!(factors(&all, |_| None).0, all.iter().map(|edge| edge.factor()).collect::<Vec<_>>());
 }
 
 /// What its clouds are uncertain by and what is left of it, together, are never less than an alignment's covariance, and
@@ -123,7 +122,7 @@ fn no_alignment_claims_more_than_it_did() {
                 EdgeEstimate { weight: if k == 4 { 0.25 } else { 1.0 }, ..edge(k, i, j, t(k), COMMON_MAX) }
             })
             .collect();
-        let graph = factors(&all.iter().collect::<Vec<_>>(), |_| None);
+        let (graph, _) = factors(&all.iter().collect::<Vec<_>>(), |_| None);
         let cloud = |id: SubmapId| covariance(graph.iter().find(|f| f.label == Label::Cloud && f.j == id).unwrap());
         assert_eq!(graph.iter().filter(|f| f.label == Label::Cloud).count(), 6);
         for (edge, factor) in all.iter().zip(&graph[6..]) {
@@ -149,8 +148,9 @@ fn no_alignment_claims_more_than_it_did() {
 fn a_cloud_lies_off_its_anchor_by_a_twelfth_of_the_walk() {
     let all = [0, 1].map(|k| edge(k, submap(1, 0), submap(2, k as usize), pose(&mut rng(8), 0.01), 0.2));
     let all: Vec<&EdgeEstimate> = all.iter().collect();
-    let walk = Covariance::from_sigmas([0.6; 6]).unwrap();
-    let [none, some] = [None, Some(&walk)].map(|walk| covariance(&factors(&all, |_| walk)[0]));
+    let walk = Walk { whole: Covariance::from_sigmas([0.6; 6]).unwrap(), keyframes: None };
+    let around = |walk: &Walk| Around { walk: *walk, steps: [None; 2] };
+    let [none, some] = [None, Some(walk)].map(|walk| covariance(&factors(&all, |_| walk.as_ref().map(around)).0[0]));
     assert!((some - none - Matrix6::from_diagonal_element(0.03)).amax() < 1e-12);
 }
 
@@ -173,7 +173,7 @@ fn charges_count_the_others_of_both_submaps() {
     let sim = SimWithCovariance { sim: t.sim(), covariance: Covariance::from_sigmas([0.01; 7]).unwrap() };
     all[0].measurement.t_i_j = Relative::Similarity(sim);
     assert_eq!(all[0].weight_at(2.0), 0.25 / 2.25);
-    assert_eq!(factors(&[&all[0]], |_| None)[0].weight, all[0].weight);
+    assert_eq!(factors(&[&all[0]], |_| None).0[0].weight, all[0].weight);
 }
 
 #[test]

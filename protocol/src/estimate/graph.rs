@@ -5,6 +5,7 @@
 //! (MATH §1: local perturbations), with the exact Jacobians of MATH §2: `∂r/∂δ_j = J_r⁻¹(r)`,
 //! `∂r/∂δ_i = −J_l⁻¹(r) Ad(t_i_j⁻¹)`. Gauge: the smallest [`SubmapId`] of a component is held fixed.
 
+use super::bend::Bend;
 use crate::geometry::sim3::{self, Matrix7, Vector7};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, se3};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -99,6 +100,8 @@ pub struct Graph {
     scales: Vec<Option<usize>>,
     scale_count: usize,
     factors: Vec<Edge>,
+    /// Of factors that follow others, by their place.
+    pub(super) bends: BTreeMap<usize, Bend>,
 }
 
 /// A factor with its nodes resolved. A map has three of them to an anchor, so that no number is held twice.
@@ -176,7 +179,8 @@ impl Graph {
         }
         let component = |(root, nodes): (usize, Vec<SubmapId>)| {
             let (scales, scale_count) = scale_variables(&nodes, unknown_scale);
-            Self { nodes, scales, scale_count, factors: edges_of.remove(&root).unwrap_or_default() }
+            let factors = edges_of.remove(&root).unwrap_or_default();
+            Self { nodes, scales, scale_count, factors, bends: BTreeMap::new() }
         };
         Ok(members.into_iter().map(component).collect())
     }
@@ -214,6 +218,7 @@ impl Graph {
         &self.factors
     }
 
+    /// Without what bends them.
     pub(super) fn into_edges(self) -> Vec<Edge> {
         self.factors
     }

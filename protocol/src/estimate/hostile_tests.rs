@@ -10,6 +10,7 @@ use crate::config::EstimateConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, SimWithCovariance};
 use crate::ids::EntryId;
 use crate::wire::fact::ScaleKind;
+use core::num::NonZero;
 use nalgebra::Vector3;
 use proptest::prelude::*;
 use rand::RngExt;
@@ -111,14 +112,18 @@ fn any_problem() -> impl Strategy<Value = MapProblem> {
     let common = prop::collection::btree_map(entry, share, 0..10);
     let two = (0..4u8, 0..4u8).prop_map(|(a, b)| (frame(a.min(b)), frame(a.max(b))));
     let ambiguous = prop::collection::btree_map(two, prop_oneof![0..9usize, Just(usize::MAX)], 0..4);
-    let problem = (frames, lists, positions, common, ambiguous);
-    problem.prop_map(|(frames, (alignments, sightings), positions, common, ambiguous)| MapProblem {
+    let keyframes = prop::collection::btree_map(id(), (1..9u16).prop_filter_map("none", NonZero::new), 0..10);
+    let gone = prop::collection::btree_map(id(), prop_oneof![0..9u32, Just(u32::MAX)], 0..10);
+    let problem = (frames, lists, positions, (common, keyframes, gone), ambiguous);
+    problem.prop_map(|(frames, (alignments, sightings), positions, (common, keyframes, gone), ambiguous)| MapProblem {
         ambiguous,
         frames,
         alignments,
         sightings,
         positions,
         common,
+        keyframes,
+        gone,
     })
 }
 

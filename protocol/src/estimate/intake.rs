@@ -3,6 +3,7 @@
 //! Facts come in any order and from anyone. Here they are sorted, repeats are set aside (one measurement counts once,
 //! DESIGN §8.10), and whatever names unknown submaps or holds invalid numbers is kept with its reason.
 
+use super::bend::Around;
 use super::distortion;
 use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
@@ -10,10 +11,12 @@ use super::position::{DIMENSION, StatedPoint};
 use super::reweight::CHI2_999;
 use super::solve::SolveError;
 use super::trajectory::Trajectory;
+use super::walk::Walk;
 use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative, So3};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
+use core::num::NonZero;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Rotation standard deviation from which a measurement says nothing, rad.
@@ -41,6 +44,8 @@ pub(super) struct Chain {
     pub(super) origin: PoseWithCovariance,
     /// `t_prev_this` of the anchors from the second on.
     pub(super) steps: Vec<PoseWithCovariance>,
+    /// Over how many submaps each step leads.
+    spans: Vec<f64>,
     /// The same, compounded.
     pub(super) trajectory: Trajectory,
 }
@@ -48,6 +53,8 @@ pub(super) struct Chain {
 /// The admitted problem. An edge counts while its `unused` is `None`.
 pub(super) struct Intake {
     pub(super) chains: BTreeMap<FrameId, Chain>,
+    /// How many keyframes made each submap, where that is told.
+    keyframes: BTreeMap<SubmapId, NonZero<u16>>,
     pub(super) unknown_scale: BTreeSet<FrameId>,
     pub(super) ambiguous: BTreeMap<(FrameId, FrameId), usize>,
     pub(super) edges: Vec<EdgeEstimate>,
@@ -55,12 +62,19 @@ pub(super) struct Intake {
 
 impl Intake {
     pub(super) fn new(problem: &MapProblem) -> Self {
-        let chain = |(&f, c): (&FrameId, &super::joint::FrameChain)| Some((f, Chain::new(&c.odometry)?));
+        let span = |frame: FrameId, place: usize| {
+            let id = u32::try_from(place).ok().map(|index| SubmapId { frame, index });
+            1.0 + f64::from(id.and_then(|id| problem.gone.get(&id).copied()).unwrap_or(0))
+        };
+        let chain = |(&f, c): (&FrameId, &super::joint::FrameChain)| {
+            Some((f, Chain::new(&c.odometry, |place| span(f, place))?))
+        };
         let chains: BTreeMap<_, _> = problem.frames.iter().filter_map(chain).collect();
         let unknown = problem.frames.iter().filter(|(_, c)| c.scale == ScaleKind::Unknown);
         let unknown_scale = unknown.map(|(&f, _)| f).collect();
         let ambiguous = problem.ambiguous.clone();
-        let mut intake = Self { chains, unknown_scale, ambiguous, edges: Vec::new() };
+        let keyframes = problem.keyframes.clone();
+        let mut intake = Self { chains, keyframes, unknown_scale, ambiguous, edges: Vec::new() };
         let alignments = sorted(&problem.alignments).into_iter().map(|m| (Kind::Alignment, m));
         let sightings = sorted(&problem.sightings).into_iter().map(|m| (Kind::Sighting, m));
         let tied = alignments.chain(sightings).map(|(kind, measurement)| EdgeEstimate::new(kind, measurement));
@@ -78,6 +92,32 @@ impl Intake {
             edge.weight = if edge.is_used() { edge.weight_at(1.0) } else { 0.0 };
         }
         intake
+    }
+
+    /// The odometry's walk while a submap was made.
+    pub(super) fn walk(&self, id: SubmapId) -> Option<Walk> {
+        let whole = self.chains.get(&id.frame)?.walk(id.index as usize)?;
+        Some(Walk { whole, keyframes: self.keyframes.get(&id).copied() })
+    }
+
+    /// The odometry around an anchor.
+    pub(super) fn around(&self, id: SubmapId) -> Option<Around<'_>> {
+        let steps = &self.chains.get(&id.frame).filter(|_| !self.unknown_scale.contains(&id.frame));
+        let step = |index: Option<usize>| steps.as_ref()?.steps.get(index?);
+        let index = id.index as usize;
+        Some(Around { walk: self.walk(id)?, steps: [step(index.checked_sub(1)), step(Some(index))] })
+    }
+
+    /// The first and the last anchor of a frame and the walks while their submaps were made, as far as their neighbours'
+    /// steps tell. Of a single step nobody knows whether it leads over a gap.
+    pub(super) fn ends(&self, frame: FrameId) -> Option<[(SubmapId, Walk); 2]> {
+        let last = self.chains.get(&frame)?.len().checked_sub(1).filter(|&last| last > 1)?;
+        let last = u32::try_from(last).ok()?;
+        let of = |index: u32, neighbour: u32| {
+            let [id, neighbour] = [index, neighbour].map(|index| SubmapId { frame, index });
+            Some((id, Walk { keyframes: self.keyframes.get(&id).copied(), ..self.walk(neighbour)? }))
+        };
+        Some([of(0, 1)?, of(last, last - 1)?])
     }
 
     fn refusal(
@@ -296,13 +336,14 @@ impl EdgeEstimate {
 
 impl Chain {
     /// The chain up to the first step that is not a valid pose or says nothing; `None` if nothing is left.
-    fn new(odometry: &[PoseWithCovariance]) -> Option<Self> {
+    fn new(odometry: &[PoseWithCovariance], span: impl Fn(usize) -> f64) -> Option<Self> {
         let holds = |t: &Relative| is_usable(t) && !says_nothing(t);
         let usable = odometry.iter().take_while(|p| holds(&Relative::Metric(**p)));
         let steps: Vec<PoseWithCovariance> = usable.copied().collect();
         let origin = *steps.first()?;
         let trajectory = Trajectory::new(steps.iter().copied());
-        Some(Self { origin, steps: steps[1..].to_vec(), trajectory })
+        let spans = (1..steps.len()).map(span).collect();
+        Some(Self { origin, steps: steps[1..].to_vec(), spans, trajectory })
     }
 
     /// Largest over smallest variance of its steps: how badly it conditions a component.
@@ -313,18 +354,11 @@ impl Chain {
 
     /// The odometry's walk while a submap was made: about that of the step to its anchor, or of the one from it; of the
     /// two the smaller, as one may lead over a gap.
-    pub(super) fn walk(&self, index: usize) -> Option<&Covariance<6>> {
-        let [to, from] = [index.checked_sub(1), Some(index)].map(|k| Some(&self.steps.get(k?)?.covariance));
-        let volume = |covariance: &&Covariance<6>| covariance.matrix().determinant();
+    fn walk(&self, index: usize) -> Option<Covariance<6>> {
+        let part = |k: usize| Some(self.steps.get(k)?.covariance.scaled(1.0 / self.spans[k]));
+        let [to, from] = [index.checked_sub(1), Some(index)].map(|k| part(k?));
+        let volume = |covariance: &Covariance<6>| covariance.matrix().determinant();
         [to, from].into_iter().flatten().min_by(|a, b| volume(a).total_cmp(&volume(b)))
-    }
-
-    /// The last anchor and the odometry's walk while its submap was made: about that of the last step, or of the one before
-    /// it, of which one may lead over a gap. Of a single step nobody knows.
-    pub(super) fn end(&self, frame: FrameId) -> Option<(SubmapId, Covariance<6>)> {
-        let last = self.len().checked_sub(1)?;
-        let before = last.checked_sub(1).filter(|&before| before > 0)?;
-        Some((SubmapId { frame, index: u32::try_from(last).ok()? }, *self.walk(before)?))
     }
 
     /// Number of anchors.

@@ -10,20 +10,20 @@
 
 use super::among::{JointError, JointPoses};
 use super::distortion::{self, Charges};
-use super::ends::{self, End};
 use super::graph::{Factor, Graph, Label};
 use super::intake::{Intake, Kind};
-use super::marginals::certain;
 use super::optimality::Optimality;
 use super::pairs::{self, Pair};
 use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
 use super::solve::{Solution, SolveError, solve_within};
+use super::walk::Walk;
 use crate::config::EstimateConfig;
-use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
+use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::snapshot::PairStatus;
 use crate::wire::fact::ScaleKind;
+use core::num::NonZero;
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 
@@ -71,6 +71,11 @@ pub struct MapProblem {
     /// in common with it, and as much of the other; 0 to 0.45 ([`COMMON_MAX`](super::distortion::COMMON_MAX)), 0 for what
     /// is not listed.
     pub common: BTreeMap<EntryId, f64>,
+    /// How many keyframes made a submap, by its place in the chain; of what is not listed nobody knows.
+    pub keyframes: BTreeMap<SubmapId, NonZero<u16>>,
+    /// How many submaps are gone from the chain before one, the steps of which are compounded in that to it; none if it is
+    /// not listed.
+    pub gone: BTreeMap<SubmapId, u32>,
     /// Between two frames, `a < b`: pairs of submaps of which one end found an alignment, and the other end that there are
     /// several. Places that repeat themselves show by it.
     pub ambiguous: BTreeMap<(FrameId, FrameId), usize>,
@@ -203,10 +208,10 @@ pub struct JointEstimate {
     components: Vec<Component>,
     component_of: BTreeMap<FrameId, usize>,
     /// `t_frame_anchor0`.
-    origins: BTreeMap<FrameId, PoseWithCovariance>,
-    /// The last anchor of each metric frame and the walk while its submap was made.
-    lasts: BTreeMap<FrameId, (SubmapId, Covariance<6>)>,
-    unknown_scale: BTreeSet<FrameId>,
+    pub(super) origins: BTreeMap<FrameId, PoseWithCovariance>,
+    /// The first and the last anchor of each metric frame and the walks while their submaps were made.
+    pub(super) ends: BTreeMap<FrameId, [(SubmapId, Walk); 2]>,
+    pub(super) unknown_scale: BTreeSet<FrameId>,
     pairs: Vec<PairEstimate>,
     edges: Vec<EdgeEstimate>,
     /// Weighted sum of squared residuals over all components.
@@ -300,11 +305,13 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
         let mut nodes: BTreeSet<SubmapId> = members.iter().flat_map(|f| intake.chains[f].ids(*f)).collect();
         let mut factors: Vec<Factor> = members.iter().flat_map(|f| intake.chains[f].factors(*f)).collect();
         let tied: Vec<&EdgeEstimate> = used().filter(|e| members.contains(&e.measurement.i.frame)).collect();
-        factors.extend(distortion::factors(&tied, |id| intake.chains.get(&id.frame)?.walk(id.index as usize)));
+        let (tied, gains) = distortion::factors(&tied, |id| intake.around(id));
+        factors.extend(tied);
         nodes.extend(factors.iter().filter(|factor| factor.label == Label::Cloud).map(|factor| factor.j));
         let solution = match Graph::components(&nodes, &intake.unknown_scale, factors) {
             Ok(mut graphs) if graphs.len() == 1 => {
-                let graph = graphs.remove(0);
+                let mut graph = graphs.remove(0);
+                graph.bend(&gains);
                 let place = |id: &SubmapId| start.get(id).or_else(|| start.get(&distortion::anchor_of(*id))).copied();
                 let start = graph.nodes().iter().map(|id| place(id).unwrap_or_else(Sim3::identity));
                 let start = start.collect();
@@ -348,7 +355,7 @@ impl JointEstimate {
     fn new(intake: Intake, pairs: Vec<Pair>, map: Map) -> Self {
         let origins = intake.chains.iter().map(|(&f, chain)| (f, chain.origin)).collect();
         let metric = intake.chains.iter().filter(|(f, _)| !intake.unknown_scale.contains(f));
-        let lasts = metric.filter_map(|(&f, chain)| Some((f, chain.end(f)?))).collect();
+        let ends = metric.filter_map(|(&f, _)| Some((f, intake.ends(f)?))).collect();
         let mut components = Vec::new();
         let mut component_of = BTreeMap::new();
         for (frames, solution) in map.solutions {
@@ -364,7 +371,7 @@ impl JointEstimate {
             components,
             component_of,
             origins,
-            lasts,
+            ends,
             unknown_scale: intake.unknown_scale,
             pairs: Vec::new(),
             edges: intake.edges,
@@ -438,50 +445,6 @@ impl JointEstimate {
         solution.joint(reference, anchors, &self.unknown_scale)
     }
 
-    /// `t_reference_anchor`: the anchor in the reference frame's coordinates.
-    pub fn anchor(&self, reference: FrameId, submap: SubmapId) -> Option<Relative> {
-        let origin = Relative::Metric(*self.origins.get(&reference)?);
-        let first = SubmapId { frame: reference, index: 0 };
-        if submap == first {
-            return Some(origin);
-        }
-        // The origin hangs on the first anchor alone, so its error is independent of all else.
-        Some(origin.compose(&self.relative(first, submap)?))
-    }
-
-    /// [`JointEstimate::anchor`] of every anchor in the reference's component, at the cost of a few of them.
-    pub fn anchors(&self, reference: FrameId) -> Vec<(SubmapId, Relative)> {
-        let first = SubmapId { frame: reference, index: 0 };
-        let (Some(origin), Some(solution)) = (self.origins.get(&reference), self.solution_of(reference, reference))
-        else {
-            return Vec::new();
-        };
-        let origin = Relative::Metric(*origin);
-        let place = |(id, t): (SubmapId, Relative)| (id, if id == first { origin } else { origin.compose(&t) });
-        let all = solution.relatives_to(first, &self.unknown_scale).into_iter();
-        all.filter(|(id, _)| !distortion::is_cloud(*id)).map(place).collect()
-    }
-
-    /// How robots go on from the last submaps of the metric frames in the reference's component, those that alignments
-    /// tell of: with it [`JointEstimate::anchor`] becomes the pose of a body.
-    pub fn ends(&self, reference: FrameId) -> BTreeMap<SubmapId, End> {
-        let first = SubmapId { frame: reference, index: 0 };
-        let solution = self.solution_of(reference, reference).filter(|_| !self.unknown_scale.contains(&reference));
-        let Some(solution) = solution else { return BTreeMap::new() };
-        let together =
-            self.lasts.iter().filter(|(frame, _)| self.component_of(**frame) == self.component_of(reference));
-        ends::ends(solution, first, together.map(|(_, (last, walk))| (*last, walk)))
-    }
-
-    /// `t_a_b` between the frames' origins.
-    pub fn frame(&self, a: FrameId, b: FrameId) -> Option<Relative> {
-        if a == b {
-            return self.component_of(a).map(|_| Relative::Metric(certain()));
-        }
-        let t_anchor0_b = Relative::Metric(*self.origins.get(&b)?).inverse();
-        Some(self.anchor(a, SubmapId { frame: b, index: 0 })?.compose(&t_anchor0_b))
-    }
-
     /// Every pair of frames with an agreed alignment, ascending.
     pub fn pairs(&self) -> &[PairEstimate] {
         &self.pairs
@@ -492,7 +455,7 @@ impl JointEstimate {
         &self.edges
     }
 
-    fn solution_of(&self, a: FrameId, b: FrameId) -> Option<&Solution> {
+    pub(super) fn solution_of(&self, a: FrameId, b: FrameId) -> Option<&Solution> {
         let component = self.component_of(a).filter(|c| self.component_of(b) == Some(*c))?;
         self.components[component].solution.as_ref().ok()
     }

@@ -5,7 +5,8 @@
 //! anchors relative to one take seven solves and one selected inversion (MATH §3: joint covariances, never sums of
 //! marginals).
 
-use super::solve::{Solution, variables_of};
+use super::graph::Edge;
+use super::solve::{Solution, Variables};
 use super::sparse::SelectedInverse;
 use crate::geometry::sim3::{Matrix7, Vector7};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
@@ -70,19 +71,44 @@ impl Solution {
         Some(Matrix7::from_fn(|r, c| lower[(r.max(c), r.min(c))]))
     }
 
-    /// Covariance of δ in `X_reference⁻¹ X_a ⊕ δ` with the perturbation of `X_a⁻¹ X_b`, between anchors of one unit: how
-    /// what a step onward from a is off by goes with what a is.
-    pub(super) fn covariance_onward(&self, reference: SubmapId, a: SubmapId, b: SubmapId) -> Option<Matrix6<f64>> {
-        let [reference, a, b] = [reference, a, b].map(|id| self.graph.position(id));
-        let (to, onward) = (self.half_solved(reference?, a?), self.half_solved(a?, b?));
-        Some(Matrix6::from_fn(|r, c| to.dot(r, &onward, c)))
+    /// Covariance of δ in `X_x⁻¹ X_a ⊕ δ` with what the factor of a's cloud is off by, between anchors of one unit.
+    pub(super) fn covariance_with_cloud(&self, x: SubmapId, a: SubmapId) -> Option<Matrix6<f64>> {
+        let [x, a] = [x, a].map(|id| self.graph.position(id));
+        let (to, cloud) = (self.half_solved(x?, a?), self.half_solve(&self.cloud_rows(a?)?));
+        Some(Matrix6::from_fn(|r, c| to.dot(r, &cloud, c)))
+    }
+
+    /// What [`Solution::covariance_with_cloud`] is from every anchor, at one solve.
+    pub(super) fn with_cloud(&self, a: SubmapId) -> Option<WithCloud<'_>> {
+        let a = self.graph.position(a)?;
+        Some(WithCloud { solution: self, a, columns: self.columns_of(&self.cloud_rows(a)?)? })
+    }
+
+    /// The row block of what the factor of an anchor's cloud is off by: that of the cloud, and of the steps that it follows.
+    fn cloud_rows(&self, anchor: usize) -> Option<Vec<(usize, Vector7)>> {
+        let (place, cloud) = self.graph.cloud_of(anchor)?;
+        let of = |edge: &Edge| {
+            self.difference(edge.i, edge.j, &(self.values[edge.j].inverse() * self.values[edge.i]).adjoint())
+        };
+        let mut rows = of(cloud);
+        for (step, gain) in self.graph.bends.get(&place).into_iter().flat_map(|bend| &bend.steps) {
+            let mut follows = Matrix7::zeros();
+            follows.fixed_view_mut::<6, 6>(0, 0).copy_from(&-gain);
+            let followed =
+                of(&self.graph.edges()[*step]).into_iter().map(|(scalar, column)| (scalar, follows * column));
+            merge(&mut rows, followed);
+        }
+        Some(rows)
     }
 
     /// `L⁻¹ Aᵀ` for the row block A of `X_a⁻¹ X_b`.
     fn half_solved(&self, a: usize, b: usize) -> HalfSolved {
         let t_b_a = self.values[b].inverse() * self.values[a];
-        let rows = self.difference(a, b, &t_b_a.adjoint());
-        let mut columns = spread(&rows, self.pattern.scalars());
+        self.half_solve(&self.difference(a, b, &t_b_a.adjoint()))
+    }
+
+    fn half_solve(&self, rows: &[(usize, Vector7)]) -> HalfSolved {
+        let mut columns = spread(rows, self.pattern.scalars());
         let touched = self.pattern.solve_upwards(&self.factor, rows.iter().map(|(scalar, _)| *scalar), &mut columns);
         HalfSolved { columns, touched, n: self.pattern.scalars() }
     }
@@ -109,23 +135,15 @@ impl Solution {
 
     /// The blocks of `H⁻¹` where `H` has any: of each variable, and of those that a factor ties.
     pub(super) fn selected_inverse(&self) -> SelectedInverse<'_> {
-        let pairs = self.graph.edges().iter().flat_map(|edge| {
-            let variables = variables_of(&self.graph, edge);
-            let later = |k: usize| variables[k + 1..].iter().map(|(b, _)| (variables[k].0, *b)).collect::<Vec<_>>();
-            (0..variables.len()).flat_map(later).collect::<Vec<_>>()
-        });
+        let pairs = (0..self.graph.edges().len()).flat_map(|edge| Variables::of(&self.graph, edge).pairs());
+        let pairs = pairs.filter(|(a, b)| a != b);
         self.pattern.selected_inverse(&self.factor, pairs)
     }
 
     /// The row block A of `δ_b − Ad δ_a` as (scalar, column of A).
     fn difference(&self, a: usize, b: usize, adjoint: &Matrix7) -> Vec<(usize, Vector7)> {
         let mut rows = self.row_block(b, &Matrix7::identity());
-        for (scalar, column) in self.row_block(a, &-adjoint) {
-            match rows.iter_mut().find(|(s, _)| *s == scalar) {
-                Some((_, sum)) => *sum += column,
-                None => rows.push((scalar, column)),
-            }
-        }
+        merge(&mut rows, self.row_block(a, &-adjoint));
         rows
     }
 
@@ -171,6 +189,25 @@ impl Solution {
     }
 }
 
+/// How what an anchor's cloud is off by goes with all anchors.
+pub(super) struct WithCloud<'a> {
+    solution: &'a Solution,
+    a: usize,
+    /// Seven.
+    columns: Vec<f64>,
+}
+
+impl WithCloud<'_> {
+    /// As [`Solution::covariance_with_cloud`].
+    pub(super) fn seen_from(&self, x: SubmapId) -> Option<Matrix6<f64>> {
+        let Solution { graph, values, .. } = self.solution;
+        let x = graph.position(x)?;
+        let adjoint = (values[self.a].inverse() * values[x]).adjoint();
+        let rows = |node| self.solution.rows(&self.columns, node);
+        Some((rows(self.a) - adjoint * rows(x)).fixed_view::<6, 6>(0, 0).into_owned())
+    }
+}
+
 /// `L⁻¹ Aᵀ`: seven columns of `n` scalars, of which all but some ranges are zero.
 struct HalfSolved {
     columns: Vec<f64>,
@@ -186,6 +223,15 @@ impl HalfSolved {
         let over =
             |range: &Range<usize>| x[range.clone()].iter().zip(&y[range.clone()]).map(|(x, y)| x * y).sum::<f64>();
         self.touched.iter().map(over).sum::<f64>()
+    }
+}
+
+fn merge(rows: &mut Vec<(usize, Vector7)>, more: impl IntoIterator<Item = (usize, Vector7)>) {
+    for (scalar, column) in more {
+        match rows.iter_mut().find(|(known, _)| *known == scalar) {
+            Some((_, sum)) => *sum += column,
+            None => rows.push((scalar, column)),
+        }
     }
 }
 

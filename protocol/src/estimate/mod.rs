@@ -1,6 +1,7 @@
 //! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
 
 pub mod among;
+mod bend;
 pub mod certificate;
 pub mod chordal;
 pub mod distortion;
@@ -15,6 +16,7 @@ pub mod marginals;
 mod minimise;
 pub mod optimality;
 mod pairs;
+mod places;
 pub mod posegraph;
 pub mod position;
 pub mod residual;
@@ -22,6 +24,7 @@ mod reweight;
 pub mod solve;
 mod sparse;
 pub mod trajectory;
+mod walk;
 mod ways;
 
 pub use intake::Kind as EdgeKind;
@@ -37,5 +40,7 @@ mod joint_tests;
 mod solve_tests;
 #[cfg(test)]
 pub(crate) mod test_graphs;
+#[cfg(test)]
+pub(crate) mod test_walks;
 #[cfg(test)]
 pub(crate) mod test_world;

@@ -3,6 +3,7 @@
 //! The result depends on the graph and the start alone; the start is made from the same set of facts, never from an
 //! earlier estimate.
 
+use super::bend::Bent;
 use super::graph::{Edge, Graph};
 use super::minimise::{Minimum, Normal, Objective, minimise};
 use super::sparse::{BlockPattern, Factor, Slot};
@@ -190,6 +191,9 @@ struct System<'a> {
 enum Terms {
     /// Between anchors of fixed unit.
     Rigid(Rigid),
+    /// A cloud's that follows its odometry: first scalar of each node, none of the one held fixed, and the slots of the pairs
+    /// (p, q), p ≤ q, of those that have one, row by row.
+    Bent { starts: Vec<Option<usize>>, slots: Vec<Slot> },
     /// All others: first scalar and part of each variable, and the slots of the pairs (p, q), p ≤ q, row by row.
     General { parts: Vec<(usize, Part)>, slots: Vec<Slot> },
 }
@@ -204,20 +208,26 @@ struct Rigid {
 
 impl<'a> System<'a> {
     fn new(graph: &'a Graph, bytes_max: u64) -> Result<Self, SolveError> {
-        let parts: Vec<_> = graph.edges().iter().map(|e| variables_of(graph, e)).collect();
+        let variables: Vec<Variables> = (0..graph.edges().len()).map(|k| Variables::of(graph, k)).collect();
         let mut sizes = vec![6; graph.nodes().len().saturating_sub(1)];
         sizes.resize(sizes.len() + graph.scale_count(), 1);
-        let pairs = parts
-            .iter()
-            .flat_map(|list| list.iter().enumerate().flat_map(move |(k, a)| list[k..].iter().map(move |b| (a.0, b.0))));
-        let [pattern] = BlockPattern::within([&sizes], pairs, bytes_max)?;
-        let terms = parts.into_iter().map(|parts| Terms::new(parts, &pattern)).collect();
+        let [pattern] = BlockPattern::within([&sizes], variables.iter().flat_map(Variables::pairs), bytes_max)?;
+        let terms = variables.into_iter().map(|variables| Terms::new(variables, &pattern)).collect();
         Ok(Self { graph, pattern, terms })
     }
 }
 
 impl Terms {
-    fn new(parts: Vec<(usize, Part)>, pattern: &BlockPattern) -> Self {
+    fn new(variables: Variables, pattern: &BlockPattern) -> Self {
+        let pairs = variables.pairs();
+        let slots = || pairs.iter().map(|&(a, b)| pattern.slot(a, b)).collect();
+        let parts = match variables {
+            Variables::Bent(nodes) => {
+                let start = |node: &usize| node.checked_sub(1).map(|variable| pattern.start(variable));
+                return Self::Bent { starts: nodes.iter().map(start).collect(), slots: slots() };
+            }
+            Variables::Of(parts) => parts,
+        };
         if parts.iter().all(|(_, part)| part.size() == 6) {
             let find = |wanted: fn(&Part) -> bool| parts.iter().find(|(_, p)| wanted(p)).map(|(v, _)| *v);
             let own = |v: usize| (pattern.start(v), pattern.slot(v, v));
@@ -229,9 +239,7 @@ impl Terms {
                 cross: j.zip(i).map(|(a, b)| pattern.slot(a, b)),
             });
         }
-        let pairs = parts.iter().enumerate().flat_map(|(k, a)| parts[k..].iter().map(move |b| (a.0, b.0)));
-        let slots = pairs.map(|(a, b)| pattern.slot(a, b)).collect();
-        Self::General { slots, parts: parts.into_iter().map(|(v, part)| (pattern.start(v), part)).collect() }
+        Self::General { slots: slots(), parts: parts.into_iter().map(|(v, part)| (pattern.start(v), part)).collect() }
     }
 }
 
@@ -243,13 +251,18 @@ impl Objective for System<'_> {
     }
 
     fn cost(&self, values: &Vec<Sim3>) -> f64 {
-        self.graph.edges().iter().map(|e| e.chi2(values)).sum()
+        self.graph.chi2(values)
     }
 
     fn linearise(&self, values: &Vec<Sim3>, normal: &mut Normal) {
-        for (edge, terms) in self.graph.edges().iter().zip(&self.terms) {
+        for (k, (edge, terms)) in self.graph.edges().iter().zip(&self.terms).enumerate() {
             match terms {
                 Terms::Rigid(rigid) => add_rigid(edge, values, *rigid, normal),
+                Terms::Bent { starts, slots } => {
+                    if let Some(bend) = self.graph.bends.get(&k) {
+                        add_bent(&bend.linearise(self.graph, edge, values), edge, starts, slots, normal);
+                    }
+                }
                 Terms::General { parts, slots } => add_general(edge, values, parts, slots, normal),
             }
         }
@@ -337,6 +350,21 @@ fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal:
     }
 }
 
+fn add_bent(bent: &Bent, edge: &Edge, starts: &[Option<usize>], slots: &[Slot], normal: &mut Normal) {
+    let information = edge.information_rigid();
+    let weighted = information * bent.residual;
+    let free: Vec<_> = bent.by.iter().zip(starts).filter_map(|((_, by), start)| Some((by, (*start)?))).collect();
+    let mut slots = slots.iter();
+    for (p, (by, start)) in free.iter().enumerate() {
+        let gradient = by.transpose() * weighted;
+        normal.g[*start..*start + 6].iter_mut().zip(&gradient).for_each(|(g, x)| *g += x);
+        let left = by.transpose() * information;
+        for ((other, _), slot) in free[p..].iter().zip(&mut slots) {
+            BlockPattern::add(&mut normal.h, *slot, &(left * *other));
+        }
+    }
+}
+
 fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[Slot], normal: &mut Normal) {
     let at = edge.linearise(values);
     let information = edge.information();
@@ -367,8 +395,35 @@ impl Part {
     }
 }
 
+/// What a factor adds to.
+pub(super) enum Variables {
+    /// A factor of its two anchors and their scales.
+    Of(Vec<(usize, Part)>),
+    /// One that follows others: its nodes, ascending.
+    Bent(Vec<usize>),
+}
+
+impl Variables {
+    pub(super) fn of(graph: &Graph, edge: usize) -> Self {
+        let factor = &graph.edges()[edge];
+        match graph.bends.get(&edge) {
+            None => Self::Of(variables_of(graph, factor)),
+            Some(bend) => Self::Bent(graph.nodes_of(bend, factor)),
+        }
+    }
+
+    /// Of its variables, the pairs (p, q), p ≤ q, row by row.
+    pub(super) fn pairs(&self) -> Vec<(usize, usize)> {
+        let list: Vec<usize> = match self {
+            Self::Of(parts) => parts.iter().map(|(variable, _)| *variable).collect(),
+            Self::Bent(nodes) => nodes.iter().filter_map(|node| node.checked_sub(1)).collect(),
+        };
+        list.iter().enumerate().flat_map(|(k, &a)| list[k..].iter().map(move |&b| (a, b))).collect()
+    }
+}
+
 /// The variables of a factor: anchors without the first, then scales.
-pub(super) fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
+fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
     let anchors = graph.nodes().len().saturating_sub(1);
     let end = |node: usize| (node.checked_sub(1), graph.scale_of(node).map(|s| anchors + s));
     parts_of(end(edge.i), end(edge.j)).into_iter().flatten().collect()

@@ -4,6 +4,7 @@
 use crate::geometry::{Covariance, PoseWithCovariance, Relative};
 use crate::ids::{EntryId, Hash, SubmapId};
 use crate::time::Stamp;
+use core::num::NonZero;
 use serde::{Deserialize, Serialize};
 
 /// One signed, immutable piece of knowledge.
@@ -53,6 +54,8 @@ pub struct SubmapFact {
     pub blob: Hash,
     /// Unit of the frame.
     pub scale: ScaleKind,
+    /// How many keyframes made it; older robots do not tell. The middle one, of an even number the earlier, is its anchor.
+    pub keyframes: Option<NonZero<u16>>,
 }
 
 /// An alignment of two submaps of different frames (or a loop closure within one), by the endpoint that computed it.

@@ -12,6 +12,7 @@ use super::pose::{EstimateError, RawPointCovariance, RawPoseWithCovariance, RawS
 use crate::geometry::Relative;
 use crate::ids::{EntryId, Hash, SubmapId};
 use crate::time::Stamp;
+use core::num::NonZero;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -144,7 +145,7 @@ impl Fact {
 /// A fact as plain numbers.
 #[derive(Clone, Debug, PartialEq)]
 enum Raw {
-    Submap(RawSubmap),
+    Submap(RawSubmap, Option<NonZero<u16>>),
     Alignment(RawAlignment),
     Verdict(RawVerdict),
     Sighting(RawSighting),
@@ -155,7 +156,7 @@ enum Raw {
 impl Raw {
     fn of(fact: &Fact) -> Result<Self, FactError> {
         Ok(match fact {
-            Fact::Submap(f) => Self::Submap(RawSubmap::of(f)?),
+            Fact::Submap(f) => Self::Submap(RawSubmap::of(f)?, f.keyframes),
             Fact::Alignment(f) => Self::Alignment(RawAlignment::of(f)?),
             Fact::Verdict(f) => Self::Verdict(RawVerdict::of(f)?),
             Fact::Sighting(f) => Self::Sighting(RawSighting::of(f)?),
@@ -166,7 +167,7 @@ impl Raw {
 
     fn parse(&self) -> Result<Fact, FactError> {
         Ok(match self {
-            Self::Submap(raw) => Fact::Submap(raw.parse()?),
+            Self::Submap(raw, keyframes) => Fact::Submap(SubmapFact { keyframes: *keyframes, ..raw.parse()? }),
             Self::Alignment(raw) => Fact::Alignment(raw.parse()?),
             Self::Verdict(raw) => Fact::Verdict(raw.parse()?),
             Self::Sighting(raw) => Fact::Sighting(raw.parse()?),
@@ -177,7 +178,8 @@ impl Raw {
 
     fn to_bytes(&self) -> Vec<u8> {
         match self {
-            Self::Submap(raw) => to_bytes(raw),
+            Self::Submap(raw, None) => to_bytes(raw),
+            Self::Submap(raw, Some(keyframes)) => [to_bytes(raw), to_bytes(keyframes)].concat(),
             Self::Alignment(raw) => to_bytes(raw),
             Self::Verdict(raw) => to_bytes(raw),
             Self::Sighting(raw) => to_bytes(raw),
@@ -188,7 +190,7 @@ impl Raw {
 
     fn from_bytes(kind: u8, bytes: &[u8]) -> Result<Self, FactError> {
         Ok(match kind {
-            KIND_SUBMAP => Self::Submap(whole(bytes)?),
+            KIND_SUBMAP => submap(bytes)?,
             KIND_ALIGNMENT => Self::Alignment(whole(bytes)?),
             KIND_VERDICT => Self::Verdict(whole(bytes)?),
             KIND_SIGHTING => Self::Sighting(whole(bytes)?),
@@ -197,6 +199,14 @@ impl Raw {
             other => return Err(FactError::UnknownKind(other)),
         })
     }
+}
+
+/// A submap, and the number of its keyframes behind it, where it is told: what submaps were written as before it was stays
+/// what it is.
+fn submap(bytes: &[u8]) -> Result<Raw, FactError> {
+    let (submap, rest) = postcard::take_from_bytes(bytes).map_err(FactError::Malformed)?;
+    let keyframes = if rest.is_empty() { None } else { Some(whole(rest)?) };
+    Ok(Raw::Submap(submap, keyframes))
 }
 
 fn whole<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, FactError> {
@@ -248,6 +258,7 @@ impl RawSubmap {
             keypoint_count: self.keypoint_count,
             blob: self.blob,
             scale: self.scale,
+            keyframes: None,
         })
     }
 }

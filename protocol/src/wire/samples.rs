@@ -6,6 +6,7 @@ use super::*;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
 use crate::time::Stamp;
+use core::num::NonZero;
 use ed25519_dalek::SigningKey;
 use nalgebra::{SMatrix, Vector3};
 
@@ -66,7 +67,9 @@ macro_rules! samples {
 samples! {
     /// Facts, by the name of their golden file.
     facts: Fact {
-        Fact::Submap(SubmapFact { scale: ScaleKind::Metric, .. }) => { "submap" => submap_fact(ScaleKind::Metric) }
+        Fact::Submap(SubmapFact { scale: ScaleKind::Metric, keyframes: None, .. }) => {
+            "submap" => submap_fact(ScaleKind::Metric)
+        }
         Fact::Submap(SubmapFact { scale: ScaleKind::Unknown, .. }) => {
             "submap_unknown_scale" => submap_fact(ScaleKind::Unknown)
         }
@@ -119,6 +122,9 @@ samples! {
                 p_j: [0.5, 0.25, 0.0],
                 covariance: Covariance::from_sigmas([0.25, 0.125, 0.5]).unwrap(),
             })
+        }
+        Fact::Submap(SubmapFact { scale: ScaleKind::Metric, keyframes: Some(_), .. }) => {
+            "submap_counted" => counted(submap_fact(ScaleKind::Metric))
         }
     }
 }
@@ -232,7 +238,16 @@ pub fn submap_fact(scale: ScaleKind) -> Fact {
         keypoint_count: 256,
         blob: Hash::of(b"blob"),
         scale,
+        keyframes: None,
     })
+}
+
+/// With the number of its keyframes.
+fn counted(fact: Fact) -> Fact {
+    match fact {
+        Fact::Submap(submap) => Fact::Submap(SubmapFact { keyframes: NonZero::new(300), ..submap }),
+        other => other,
+    }
 }
 
 fn condensed_fact() -> Fact {

@@ -3,6 +3,7 @@
 
 use super::people::{AGENTS, ROBOTS, described, key, robot, sigmas, swarm};
 use super::reader::Reader;
+use core::num::NonZero;
 use merganser_protocol::agent::io::QueryKind;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, So3};
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
@@ -236,6 +237,7 @@ fn submap_fact(r: &mut Reader) -> SubmapFact {
         keypoint_count: u16::from(look),
         blob: if (32..64).contains(&look) { Hash::of(&[look]) } else { Hash::of(blob) },
         scale: if look > 200 { ScaleKind::Unknown } else { ScaleKind::Metric },
+        keyframes: NonZero::new(u16::from(look / 8)),
     }
 }
 

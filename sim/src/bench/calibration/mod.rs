@@ -26,6 +26,9 @@ const BAND: [f64; 2] = [0.93, 1.07];
 /// Standard errors that the mean of few runs may be off by.
 const ERRORS: f64 = 2.576;
 
+/// Standard deviations that may be asked for, m or rad.
+const SIGMA: core::ops::RangeInclusive<f64> = 1e-4..=1.0;
+
 /// `bench calibration`.
 #[derive(Debug, Args)]
 pub struct Calibration {
@@ -38,6 +41,9 @@ pub struct Calibration {
     /// The first swarm's seed
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..1 << 62))]
     first: u64,
+    /// How sure alignments are: standard deviations, m and rad
+    #[arg(long, num_args = 2, value_names = ["M", "RAD"], value_parser = sigma)]
+    sigma: Option<Vec<f64>>,
 }
 
 /// How alignments err.
@@ -84,6 +90,7 @@ pub struct Means {
 /// # Errors
 /// A run that cannot be made, that broke an invariant or did not merge; standard output that cannot be written.
 pub fn run(options: &Calibration) -> anyhow::Result<bool> {
+    let sigma = options.sigma.as_deref().and_then(|sigma| <[f64; 2]>::try_from(sigma).ok());
     let worlds = if options.world.is_empty() { vec![World::Lidar, World::Depth] } else { options.world.clone() };
     let bar = progress_bar(worlds.len() as u64 * options.seeds, "swarms")?;
     let mut out = std::io::stdout().lock();
@@ -94,7 +101,7 @@ pub fn run(options: &Calibration) -> anyhow::Result<bool> {
         "", "swarms", "condensed", "frames", "submaps", "live poses"
     )?;
     for world in worlds {
-        let means = measure(world, options.first..options.first + options.seeds, || bar.inc(1))?;
+        let means = measure(world, sigma, options.first..options.first + options.seeds, || bar.inc(1))?;
         let [frames, submaps, live] = means.of.map(|mean| mean.to_string());
         let (swarms, condensed) = (means.swarms, means.condensed);
         bar.suspend(|| writeln!(out, "{world:<8} {swarms:>6} {condensed:>10} {frames:>15} {submaps:>15} {live:>15}"))?;
@@ -110,28 +117,35 @@ pub fn run(options: &Calibration) -> anyhow::Result<bool> {
     Ok(all)
 }
 
-/// Runs swarms of these seeds; `tick` is called after each.
+/// Runs swarms of these seeds, with alignments as sure as `sigma` says or as the scenario does; `tick` is called after each.
 ///
 /// # Errors
 /// A run that cannot be made, that broke an invariant or did not merge.
-pub fn measure(world: World, seeds: core::ops::Range<u64>, mut tick: impl FnMut()) -> anyhow::Result<Means> {
+pub fn measure(
+    world: World,
+    sigma: Option<[f64; 2]>,
+    seeds: core::ops::Range<u64>,
+    mut tick: impl FnMut(),
+) -> anyhow::Result<Means> {
     let mut samples = Vec::new();
     for seed in seeds {
-        samples.push(sample(world, seed).with_context(|| format!("{world} seed {seed}"))?);
+        samples.push(sample(world, sigma, seed).with_context(|| format!("{world} seed {seed}"))?);
         tick();
     }
     let of = [|s: &Sample| s.frames, |s: &Sample| s.submaps, |s: &Sample| s.live].map(|of| Mean::of(&samples, of));
     Ok(Means { of, swarms: samples.len(), condensed: samples.iter().filter(|sample| sample.condensed).count() })
 }
 
-fn sample(world: World, seed: u64) -> anyhow::Result<Sample> {
+fn sample(world: World, sigma: Option<[f64; 2]>, seed: u64) -> anyhow::Result<Sample> {
     let mut scenario = Scenario::parse(SCENARIO)?;
     let (sensor, common) = match world {
         World::Lidar => (Sensor::Lidar3d, 0.2),
         World::Depth => (Sensor::Points3d, 0.5),
     };
     scenario.config.submap.sensor = sensor;
-    scenario.summary.as_mut().context("no summary")?.common = common;
+    let summary = scenario.summary.as_mut().context("no summary")?;
+    summary.common = common;
+    summary.sigma = sigma.unwrap_or(summary.sigma);
     let outcome = Swarm::<Agent>::new(scenario, seed)?.run(|_| {})?;
     if let Some(violation) = &outcome.violation {
         anyhow::bail!("{} at {:.1} s: {}", violation.invariant, violation.at_secs, violation.what);
@@ -191,6 +205,12 @@ fn live(outcome: &Outcome<Agent>, snapshot: &Snapshot, t_world_own: &Se3) -> any
 fn mean(nees: Vec<f64>) -> anyhow::Result<f64> {
     ensure!(!nees.is_empty(), "nothing to measure");
     Ok(nees.iter().sum::<f64>() / nees.len() as f64 / DOF)
+}
+
+fn sigma(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("{text} is no number"))?;
+    let holds = SIGMA.contains(&value);
+    holds.then_some(value).ok_or_else(|| format!("{value} is out of range; use {} to {}", SIGMA.start(), SIGMA.end()))
 }
 
 impl Mean {

@@ -7,6 +7,7 @@ use crate::dice::Dice;
 use crate::field::{Field, Layout, TICK};
 use crate::queue::Queue;
 use anyhow::Context;
+use core::num::NonZero;
 use core::time::Duration;
 use ed25519_dalek::SigningKey;
 use merganser_protocol::config::GossipConfig;
@@ -493,5 +494,6 @@ fn fact(index: u32) -> anyhow::Result<Fact> {
         keypoint_count: 384,
         blob: Hash::of(&index.to_le_bytes()),
         scale: ScaleKind::Metric,
+        keyframes: NonZero::new(4),
     }))
 }

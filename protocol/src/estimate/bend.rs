@@ -1,0 +1,159 @@
+//! What a cloud owes to the odometry on either side of its anchor. Of the error d of where the cloud lies by its anchor, a
+//! part is told by what the steps to and from the anchor are off by, which bent it ([`walk`](super::walk)): with `r_k` and
+//! `r_{k+1}` the residuals of these steps and Σ their covariances, the cloud's factor is that of
+//! `d − Cov(d, r_k) Σ_k⁻¹ r_k − Cov(d, r_{k+1}) Σ_{k+1}⁻¹ r_{k+1}`, of what is then left of d's covariance: a factor of four
+//! nodes. What neighbouring clouds still have in common, by the step between them, is left out.
+//!
+//! *Worked out* for one axis of a chain of twelve submaps of four keyframes, each aligned one to four times with what is known,
+//! of 0.2, 1 and 4 times the walk's variance: anchors amid the chain have 1.02, 1.01 and 1.00 of the variance that they
+//! claim. Without it they have 1.27, 1.13 and 1.04, and 6, 2 and 1 % more than with it.
+
+use super::graph::{Edge, Graph, Label};
+use super::walk::{Stretch, Walk};
+use crate::geometry::{Covariance, PoseWithCovariance, Sim3};
+use crate::ids::SubmapId;
+use nalgebra::{Matrix6, Vector6};
+use std::collections::BTreeMap;
+
+/// The odometry around an anchor.
+pub(super) struct Around<'a> {
+    /// While its submap was made.
+    pub(super) walk: Walk,
+    /// To the anchor and from it, in a frame whose unit is known.
+    pub(super) steps: [Option<&'a PoseWithCovariance>; 2],
+}
+
+/// By how much a cloud follows the residuals of the steps to and from its anchor.
+pub(super) type Gains = [Option<Matrix6<f64>>; 2];
+
+/// The covariance of how a cloud lies by its anchor, given the residuals of the steps to and from it; of those, that it
+/// follows. `common` is what alignments have in common but for the walk.
+pub(super) fn owed(
+    common: &Covariance<6>,
+    walk: &Walk,
+    [to, from]: [Option<&PoseWithCovariance>; 2],
+) -> (Covariance<6>, Gains) {
+    let Some(drift) = walk.off_anchor() else { return (*common, [None; 2]) };
+    let whole = common.plus(&drift);
+    let to = to.zip(walk.before_anchor()).and_then(|(step, lost)| Followed::new(&lost, &step.covariance, -1.0));
+    // Seen from the anchor at which the step begins.
+    let from = from.zip(walk.after_anchor()).and_then(|(step, lost)| {
+        let followed = Followed::new(&lost, &step.covariance.transported(&step.pose.adjoint()).ok()?, 1.0)?;
+        Some(Followed { gain: followed.gain * step.pose.adjoint(), ..followed })
+    });
+    let told = [&to, &from].into_iter().flatten().map(|followed| followed.told).sum::<Matrix6<f64>>();
+    match Covariance::new(whole.matrix() - told) {
+        Ok(left) => (left, [to, from].map(|followed| Some(followed?.gain))),
+        Err(_) => (whole, [None; 2]),
+    }
+}
+
+/// What a step's residual tells of a cloud.
+struct Followed {
+    gain: Matrix6<f64>,
+    /// So much of the cloud's covariance.
+    told: Matrix6<f64>,
+}
+
+impl Followed {
+    /// `sign` says whether the residual leads away from the anchor or to it; both are seen from there.
+    fn new(stretch: &Stretch, step: &Covariance<6>, sign: f64) -> Option<Self> {
+        let together = step.meet(&stretch.lost)? * (sign * stretch.follows);
+        let gain = together * step.information();
+        let told = gain * together.transpose();
+        Some(Self { gain, told: (told + told.transpose()) * 0.5 })
+    }
+}
+
+/// A cloud's factor that follows steps of odometry.
+#[derive(Clone, Debug)]
+pub(super) struct Bend {
+    /// The edges of the steps, and by how much of their residuals.
+    pub(super) steps: Vec<(usize, Matrix6<f64>)>,
+}
+
+/// The residual of such a factor, and its Jacobians by the perturbations of its nodes, ascending.
+pub(super) struct Bent {
+    pub(super) residual: Vector6<f64>,
+    pub(super) by: Vec<(usize, Matrix6<f64>)>,
+}
+
+impl Bend {
+    fn residual(&self, graph: &Graph, cloud: &Edge, values: &[Sim3]) -> Vector6<f64> {
+        let of = |edge: &Edge| edge.residual(values).fixed_rows::<6>(0).into_owned();
+        let steps = self.steps.iter().map(|(step, gain)| gain * of(&graph.edges()[*step]));
+        of(cloud) - steps.sum::<Vector6<f64>>()
+    }
+
+    pub(super) fn linearise(&self, graph: &Graph, cloud: &Edge, values: &[Sim3]) -> Bent {
+        let mut bent = Bent { residual: Vector6::zeros(), by: Vec::with_capacity(4) };
+        bent.add(cloud, values, &Matrix6::identity());
+        self.steps.iter().for_each(|(step, gain)| bent.add(&graph.edges()[*step], values, &-gain));
+        bent.by.sort_by_key(|(node, _)| *node);
+        bent
+    }
+}
+
+impl Bent {
+    fn add(&mut self, edge: &Edge, values: &[Sim3], gain: &Matrix6<f64>) {
+        let (residual, by_j, adjoint) = edge.linearise_rigid(values);
+        self.residual += gain * residual;
+        let by_j = gain * by_j;
+        for (node, jacobian) in [(edge.i, -by_j * adjoint), (edge.j, by_j)] {
+            match self.by.iter_mut().find(|(known, _)| *known == node) {
+                Some((_, sum)) => *sum += jacobian,
+                None => self.by.push((node, jacobian)),
+            }
+        }
+    }
+}
+
+impl Graph {
+    /// Lets the clouds of these anchors, of frames without a scale variable, follow the steps to and from them.
+    pub(super) fn bend(&mut self, gains: &BTreeMap<SubmapId, Gains>) {
+        let of = |label: Label| self.edges().iter().enumerate().filter(move |(_, edge)| edge.label == label);
+        let steps: BTreeMap<(usize, usize), usize> = of(Label::Odometry).map(|(k, e)| ((e.i, e.j), k)).collect();
+        let bend = |(k, cloud): (usize, &Edge)| {
+            let gains = gains.get(&self.nodes()[cloud.i])?;
+            let anchor = self.nodes()[cloud.i];
+            let beside = |index: Option<u32>| self.position(SubmapId { index: index?, ..anchor });
+            let [before, after] = [anchor.index.checked_sub(1), anchor.index.checked_add(1)].map(beside);
+            let ends = [before.map(|before| (before, cloud.i)), after.map(|after| (cloud.i, after))];
+            let step =
+                |(ends, gain): (Option<(usize, usize)>, &Option<Matrix6<f64>>)| Some((*steps.get(&ends?)?, (*gain)?));
+            let steps: Vec<_> = ends.into_iter().zip(gains).filter_map(step).collect();
+            (!steps.is_empty()).then_some((k, Bend { steps }))
+        };
+        self.bends = of(Label::Cloud).filter_map(bend).collect();
+    }
+
+    /// Weighted sum of squared residuals.
+    pub(super) fn chi2(&self, values: &[Sim3]) -> f64 {
+        let one = |(k, edge): (usize, &Edge)| match self.bends.get(&k) {
+            None => edge.chi2(values),
+            Some(bend) => {
+                let r = bend.residual(self, edge, values);
+                r.dot(&(edge.information_rigid() * r))
+            }
+        };
+        self.edges().iter().enumerate().map(one).sum()
+    }
+
+    /// The factor of an anchor's cloud, and its place.
+    pub(super) fn cloud_of(&self, anchor: usize) -> Option<(usize, &Edge)> {
+        self.edges().iter().enumerate().find(|(_, edge)| edge.label == Label::Cloud && edge.i == anchor)
+    }
+
+    /// The nodes of a factor that follows others.
+    pub(super) fn nodes_of(&self, bend: &Bend, cloud: &Edge) -> Vec<usize> {
+        let steps = bend.steps.iter().map(|(step, _)| &self.edges()[*step]);
+        let mut nodes: Vec<usize> = steps.chain([cloud]).flat_map(|edge| [edge.i, edge.j]).collect();
+        nodes.sort_unstable();
+        nodes.dedup();
+        nodes
+    }
+}
+
+#[cfg(test)]
+#[path = "bend_tests.rs"]
+mod tests;
