@@ -21,7 +21,7 @@ use std::path::Path;
 use thiserror::Error;
 
 /// Version of the format.
-const VERSION: u32 = 4;
+const VERSION: u32 = 5;
 /// Largest frame read, in bytes: a keyframe of [`crate::observation::POINTS_MAX`] points is 4.8 MB, a restored store may be more.
 const FRAME_LEN_MAX: u32 = 1 << 30;
 
@@ -80,6 +80,10 @@ pub enum StoredRecord {
     EpochClosed(u32),
     /// What a log's writer has replaced.
     Replaced(EntryId, Vec<SubmapId>, Vec<Hash>),
+    /// The front end's run of an own epoch, and those that are over.
+    Session(u32, u64, Vec<u64>),
+    /// A pair that was refused, and what that rests on.
+    Refused(SubmapId, SubmapId, Option<u64>),
 }
 
 impl From<&Record> for StoredRecord {
@@ -91,6 +95,8 @@ impl From<&Record> for StoredRecord {
             Record::Fork { frame, proof } => Self::Fork(*frame, proof.clone()),
             Record::EpochClosed { epoch } => Self::EpochClosed(*epoch),
             Record::Replaced { below, submaps, blobs } => Self::Replaced(*below, submaps.clone(), blobs.clone()),
+            Record::Session { epoch, session, over } => Self::Session(*epoch, *session, over.clone()),
+            Record::Refused { i, j, evidence } => Self::Refused(*i, *j, *evidence),
         }
     }
 }
@@ -104,6 +110,8 @@ impl From<StoredRecord> for Record {
             StoredRecord::Fork(frame, proof) => Self::Fork { frame, proof },
             StoredRecord::EpochClosed(epoch) => Self::EpochClosed { epoch },
             StoredRecord::Replaced(below, submaps, blobs) => Self::Replaced { below, submaps, blobs },
+            StoredRecord::Session(epoch, session, over) => Self::Session { epoch, session, over },
+            StoredRecord::Refused(i, j, evidence) => Self::Refused { i, j, evidence },
         }
     }
 }

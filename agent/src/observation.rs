@@ -52,8 +52,8 @@
 //! Another one begins a new epoch at once, since what a SLAM that was reset to its origin says has nothing to do with what it
 //! said before. Without it a reset shows only by the jump, if that is longer than a few keyframes' way, and a few keyframes
 //! are lost. Two that take turns are two SLAMs: of the one that began earlier all is refused. An agent that starts again itself
-//! does not know what session it was before: with a SLAM that was reset meanwhile, run it with `--new-epoch`. A message may do
-//! without (in postcard: end with its place).
+//! remembers the session; where none was said it takes the SLAM to go on, and with one that was reset meanwhile must be run
+//! with `--new-epoch`. A message may do without (in postcard: end with its place).
 //!
 //! ```text
 //! "session": 1700000000

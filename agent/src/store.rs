@@ -206,7 +206,8 @@ fn weight(batch: &Batch) -> usize {
     let bytes = |record: &Record| match record {
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } | Record::Private { bytes, .. } => bytes.len(),
         Record::Fork { proof, .. } => proof.iter().map(Vec::len).sum(),
-        Record::EpochClosed { .. } | Record::Replaced { .. } => 0,
+        // A few bytes each.
+        Record::EpochClosed { .. } | Record::Replaced { .. } | Record::Session { .. } | Record::Refused { .. } => 0,
     };
     batch.records.iter().map(bytes).sum()
 }

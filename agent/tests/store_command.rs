@@ -55,7 +55,7 @@ fn a_sound_store_is_verified_counted_and_exported() {
     assert!(said.ends_with("7 entries, 0 blobs, 0 private records, 0 forks: sound\n"), "{said}");
     let (code, said, _) = merganser(dir.path(), &["store", "stats", "-c", "a.toml"]);
     assert_eq!(code, Some(0));
-    for part in ["schema 2, of test/alpha", "0 damaged", "alpha/7 ", "beta/8 ", "2 logs"] {
+    for part in ["schema 4, of test/alpha", "0 damaged", "alpha/7 ", "beta/8 ", "2 logs"] {
         assert!(said.contains(part), "no {part:?} in {said}");
     }
     let (code, said, _) = merganser(dir.path(), &["store", "export", "-c", "a.toml", "--out", "facts.jsonl"]);

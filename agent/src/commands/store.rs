@@ -17,6 +17,9 @@ use std::collections::BTreeMap;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+/// Bytes of a refused pair: two submaps, and a digest.
+const REFUSED_LEN: usize = 40;
+
 /// What `merganser store` can be told.
 #[derive(Clone, Debug, Subcommand)]
 pub enum StoreCommand {
@@ -123,7 +126,8 @@ fn verify(config: &Path) -> Result<bool> {
                 forks += 1;
                 proofs.push((*frame, a.clone(), b.clone()));
             }
-            Record::EpochClosed { .. } | Record::Replaced { .. } => {}
+            // Their seals are all that can be wrong with them.
+            Record::EpochClosed { .. } | Record::Session { .. } | Record::Refused { .. } | Record::Replaced { .. } => {}
         }
     }
     let count = entries.len();
@@ -183,14 +187,15 @@ fn keys(config: &FileConfig) -> Result<BTreeMap<RobotId, VerifyingKey>> {
 fn stats(config: &Path) -> Result<bool> {
     let (config, seen) = open(config)?;
     let mut logs: BTreeMap<FrameId, (u64, u64)> = BTreeMap::new();
-    let mut others = BTreeMap::from([("blobs", (0, 0)), ("forks", (0, 0)), ("private", (0, 0))]);
+    let mut others = BTreeMap::from(["blobs", "forks", "private", "refused"].map(|name| (name, (0, 0))));
     for record in &seen.records {
         let (row, bytes): (&mut (u64, u64), _) = match record {
             Record::Entry { id, bytes } => (logs.entry(id.frame).or_default(), bytes.len()),
             Record::Blob { bytes, .. } => (others.entry("blobs").or_default(), bytes.len()),
             Record::Private { bytes, .. } => (others.entry("private").or_default(), bytes.len()),
             Record::Fork { proof: [a, b], .. } => (others.entry("forks").or_default(), a.len() + b.len()),
-            Record::EpochClosed { .. } | Record::Replaced { .. } => continue,
+            Record::Refused { .. } => (others.entry("refused").or_default(), REFUSED_LEN),
+            Record::EpochClosed { .. } | Record::Session { .. } | Record::Replaced { .. } => continue,
         };
         row.0 += 1;
         row.1 += bytes as u64;

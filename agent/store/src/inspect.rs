@@ -1,8 +1,8 @@
 //! Reading a whole store without trusting it: what is sound, what is not, and whether an entry may be missing.
 
 use crate::mend::Medium;
-use crate::tables::{self, BLOBS, ENTRIES, FORKS, META, PRIVATE, number, split_key, unseal, unsealed};
-use crate::{SCHEMA, StoreError, mend};
+use crate::tables::{self, BLOBS, ENTRIES, FORKS, META, PRIVATE, REFUSED, number, split_key, unseal, unsealed};
+use crate::{REFUSING, SCHEMA, SEALED, StoreError, mend};
 use merganser_protocol::agent::io::Record;
 use merganser_protocol::ids::{EntryId, Hash, SubmapId};
 use merganser_protocol::wire::Entry;
@@ -93,8 +93,11 @@ pub(crate) fn read(db: &mut Database) -> Result<Inspection, String> {
             seen.read_entries(db, version);
             seen.read_blobs(db, version);
             seen.read_private(db, version);
-            if version >= SCHEMA {
+            if version >= SEALED {
                 seen.read_forks(db);
+            }
+            if version >= REFUSING {
+                seen.read_refused(db);
             }
         }
     }
@@ -175,17 +178,20 @@ impl Inspection {
         self.owner = self.sealed_meta(db, version, tables::META_OWNER).and_then(|bytes| String::from_utf8(bytes).ok());
         self.fresh_epoch = self.sealed_meta(db, version, tables::META_FRESH_EPOCH).as_deref().and_then(number);
         self.closed_epoch = self.sealed_meta(db, version, tables::META_CLOSED_EPOCH).as_deref().and_then(number);
+        self.look_for_lost_keys(db);
+        let session = self.sealed_meta(db, version, tables::META_SESSION);
+        self.records.extend(session.as_deref().and_then(tables::split_session));
     }
 
     fn sealed_meta(&mut self, db: &Database, version: u32, key: &'static str) -> Option<Vec<u8>> {
-        let optional = key == tables::META_CLOSED_EPOCH;
+        let optional = [tables::META_CLOSED_EPOCH, tables::META_SESSION].contains(&key);
         match meta(db, key) {
-            Ok(Some(value)) if version < SCHEMA => Some(value),
+            Ok(Some(value)) if version < SEALED => Some(value),
             Ok(Some(value)) => {
                 let sound = unseal("meta", key.as_bytes(), &value).map(<[u8]>::to_vec);
                 if sound.is_none() {
                     self.add("meta", key.into(), "its seal is broken".into());
-                    // That an epoch was closed may be what was lost.
+                    // That an epoch was closed may be what was lost, or that the front end began another run.
                     self.entries_lost |= optional;
                 }
                 sound
@@ -200,12 +206,25 @@ impl Inspection {
         }
     }
 
+    /// A key that nobody wrote was another, and perhaps one that need not be there.
+    fn look_for_lost_keys(&mut self, db: &Database) {
+        let lost = match meta_keys(db) {
+            Ok(keys) => keys.iter().any(|key| !tables::META_KEYS.contains(&key.as_str())),
+            Err(Trouble::Damaged(_)) => true,
+            Err(trouble) => return self.meet("meta", "keys".into(), trouble),
+        };
+        if lost {
+            self.add("meta", "a key".into(), "it is none that was written".into());
+            self.entries_lost = true;
+        }
+    }
+
     fn read_entries(&mut self, db: &Database, version: u32) {
         for (key, value) in self.scan(db, ENTRIES, "entries") {
             let (frame, seq) = split_key(key);
             let id = EntryId { frame, seq };
             // Of old, nothing was sealed: an entry at least names its place.
-            let sound = if version < SCHEMA {
+            let sound = if version < SEALED {
                 Entry::decode(&value).is_ok_and(|entry| entry.id() == id).then_some(value)
             } else {
                 unsealed("entries", &key, value)
@@ -219,7 +238,7 @@ impl Inspection {
 
     fn read_blobs(&mut self, db: &Database, version: u32) {
         for (key, value) in self.scan(db, BLOBS, "blobs") {
-            let bytes = if version < SCHEMA { Some(value) } else { unsealed("blobs", &key, value) };
+            let bytes = if version < SEALED { Some(value) } else { unsealed("blobs", &key, value) };
             match bytes.filter(|bytes| Hash::of(bytes).0 == key) {
                 Some(bytes) => self.records.push(Record::Blob { hash: Hash(key), bytes }),
                 None => self.add("blobs", Hash(key).to_string(), "its bytes are not those that its hash names".into()),
@@ -231,7 +250,7 @@ impl Inspection {
         for (key, value) in self.scan(db, PRIVATE, "private") {
             let (frame, index) = split_key(key);
             let submap = SubmapId { frame, index };
-            match if version < SCHEMA { Some(value) } else { unsealed("private", &key, value) } {
+            match if version < SEALED { Some(value) } else { unsealed("private", &key, value) } {
                 Some(bytes) => self.records.push(Record::Private { submap, bytes }),
                 None => self.add("private", submap.to_string(), "its bytes have changed".into()),
             }
@@ -244,6 +263,18 @@ impl Inspection {
             match unseal("forks", &key, &value).and_then(tables::split_proof) {
                 Some(proof) => self.records.push(Record::Fork { frame, proof }),
                 None => self.add("forks", frame.to_string(), "its bytes have changed".into()),
+            }
+        }
+    }
+
+    fn read_refused(&mut self, db: &Database) {
+        for (key, value) in self.scan(db, REFUSED, "refused") {
+            let [i, j] = tables::split_pair(key);
+            let evidence =
+                unseal("refused", &key, &value).and_then(|value| value.try_into().ok()).map(u64::from_le_bytes);
+            match evidence {
+                Some(_) => self.records.push(Record::Refused { i, j, evidence }),
+                None => self.add("refused", format!("{i} {j}"), "its bytes have changed".into()),
             }
         }
     }
@@ -332,6 +363,13 @@ fn meta(db: &Database, key: &str) -> Result<Option<Vec<u8>>, Trouble> {
         Ok(table) => Ok(table.get(key)?.map(|value| value.value().to_vec())),
         Err(TableError::TableDoesNotExist(_)) => Ok(None),
         Err(error) => Err(error.into()),
+    })
+}
+
+fn meta_keys(db: &Database) -> Result<Vec<String>, Trouble> {
+    attempt(|| {
+        let meta = db.begin_read()?.open_table(META)?;
+        meta.iter()?.map(|row| Ok(row?.0.value().to_owned())).collect()
     })
 }
 

@@ -33,8 +33,13 @@ use merganser_protocol::ids::{Name, RobotId};
 use redb::Database;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// Version of the tables that this crate writes. Version 1 had no seals; it is migrated.
-pub const SCHEMA: u32 = 2;
+/// Version of the tables that this crate writes. Version 1 had no seals, version 2 no refused pairs; both are migrated.
+/// Two versions differ in two bits, so that a flipped one makes none of another.
+pub const SCHEMA: u32 = 4;
+/// The first version that sealed what it wrote, and kept forks.
+const SEALED: u32 = 2;
+/// The first version that kept refused pairs.
+const REFUSING: u32 = 4;
 /// Cache of the database, in bytes. Facts are read at a start and then only written, so that a small one serves.
 const CACHE_BYTES: usize = 2 << 20;
 

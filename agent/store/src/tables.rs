@@ -5,7 +5,7 @@
 
 use crate::CommitError;
 use merganser_protocol::agent::io::Record;
-use merganser_protocol::ids::{FrameId, Hash, RobotId};
+use merganser_protocol::ids::{FrameId, Hash, RobotId, SubmapId};
 use redb::{Database, Durability, Key, ReadableTable, TableDefinition, WriteTransaction};
 use std::any::Any;
 
@@ -13,6 +13,7 @@ pub(crate) const ENTRIES: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition
 pub(crate) const BLOBS: TableDefinition<'_, [u8; 32], &[u8]> = TableDefinition::new("blobs");
 pub(crate) const PRIVATE: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition::new("private");
 pub(crate) const FORKS: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition::new("forks");
+pub(crate) const REFUSED: TableDefinition<'_, [u8; 32], &[u8]> = TableDefinition::new("refused");
 pub(crate) const META: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("meta");
 
 /// Keys of `meta`. The schema is not sealed: its place and form are the same in all versions.
@@ -20,6 +21,8 @@ pub(crate) const META_SCHEMA: &str = "schema";
 pub(crate) const META_OWNER: &str = "owner";
 pub(crate) const META_FRESH_EPOCH: &str = "fresh_epoch";
 pub(crate) const META_CLOSED_EPOCH: &str = "closed_epoch";
+pub(crate) const META_SESSION: &str = "session";
+pub(crate) const META_KEYS: [&str; 5] = [META_SCHEMA, META_OWNER, META_FRESH_EPOCH, META_CLOSED_EPOCH, META_SESSION];
 
 const SEAL_LEN: usize = 8;
 
@@ -65,6 +68,37 @@ pub(crate) fn split_key(key: [u8; 16]) -> (FrameId, u32) {
     (FrameId { robot, epoch: (number >> 32) as u32 }, number as u32)
 }
 
+/// Both submaps of a pair.
+pub(crate) fn join_pair(i: SubmapId, j: SubmapId) -> [u8; 32] {
+    let mut key = [0; 32];
+    key[..16].copy_from_slice(&join_key(i.frame, i.index));
+    key[16..].copy_from_slice(&join_key(j.frame, j.index));
+    key
+}
+
+/// The submaps of a pair's key.
+pub(crate) fn split_pair(key: [u8; 32]) -> [SubmapId; 2] {
+    [0, 16].map(|at| {
+        let (frame, index) = split_key(core::array::from_fn(|k| key[at + k]));
+        SubmapId { frame, index }
+    })
+}
+
+/// The epoch, its run, and those that are over.
+fn join_session(epoch: u32, session: u64, over: &[u64]) -> Vec<u8> {
+    let sessions = [session].into_iter().chain(over.iter().copied()).flat_map(u64::to_le_bytes);
+    epoch.to_le_bytes().into_iter().chain(sessions).collect()
+}
+
+/// What [`join_session`] joined.
+pub(crate) fn split_session(bytes: &[u8]) -> Option<Record> {
+    let (epoch, rest) = bytes.split_first_chunk()?;
+    let (session, rest) = rest.split_first_chunk()?;
+    let (over, []) = rest.as_chunks() else { return None };
+    let over = over.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect();
+    Some(Record::Session { epoch: u32::from_le_bytes(*epoch), session: u64::from_le_bytes(*session), over })
+}
+
 /// The length of the first, and both.
 fn join_proof([a, b]: &[Vec<u8>; 2]) -> Vec<u8> {
     [&u32::try_from(a.len()).unwrap_or(u32::MAX).to_le_bytes()[..], a, b].concat()
@@ -95,6 +129,7 @@ pub(crate) fn make(transaction: &WriteTransaction) -> Result<(), CommitError> {
     transaction.open_table(BLOBS)?;
     transaction.open_table(PRIVATE)?;
     transaction.open_table(FORKS)?;
+    transaction.open_table(REFUSED)?;
     transaction.open_table(META)?;
     Ok(())
 }
@@ -130,12 +165,24 @@ fn put(transaction: &WriteTransaction, record: &Record) -> Result<(), CommitErro
             Ok(())
         }
         Record::EpochClosed { epoch } => {
-            let before = {
-                let meta = transaction.open_table(META)?;
-                let before = meta.get(META_CLOSED_EPOCH)?;
-                before.and_then(|sealed| number(unseal("meta", META_CLOSED_EPOCH.as_bytes(), sealed.value())?))
-            };
+            let before = get_meta(transaction, META_CLOSED_EPOCH)?.as_deref().and_then(number);
             put_meta(transaction, META_CLOSED_EPOCH, &before.unwrap_or(0).max(*epoch).to_le_bytes())
+        }
+        Record::Session { epoch, session, over } => {
+            let before = get_meta(transaction, META_SESSION)?.as_deref().and_then(split_session);
+            let is_later = |before| matches!(before, Record::Session { epoch: of, .. } if of > *epoch);
+            match before.is_some_and(is_later) {
+                true => Ok(()),
+                false => put_meta(transaction, META_SESSION, &join_session(*epoch, *session, over)),
+            }
+        }
+        Record::Refused { i, j, evidence } => {
+            let key = join_pair(*i, *j);
+            match evidence {
+                Some(evidence) => drop(insert(transaction, REFUSED, "refused", key, &key, &evidence.to_le_bytes())?),
+                None => drop(transaction.open_table(REFUSED)?.remove(key)?),
+            }
+            Ok(())
         }
         Record::Replaced { below, submaps, blobs } => {
             let entries = join_key(below.frame, 0)..join_key(below.frame, below.seq);
@@ -165,6 +212,13 @@ fn insert<K: Key + 'static>(
     let mut table = transaction.open_table(table)?;
     let before = table.insert(key, seal(name, key_bytes, value).as_slice())?;
     Ok(before.and_then(|before| unseal(name, key_bytes, before.value()).map(<[u8]>::to_vec)))
+}
+
+/// What is there under this key, if that is sound.
+fn get_meta(transaction: &WriteTransaction, key: &str) -> Result<Option<Vec<u8>>, CommitError> {
+    let meta = transaction.open_table(META)?;
+    let sealed = meta.get(key)?;
+    Ok(sealed.and_then(|sealed| unseal("meta", key.as_bytes(), sealed.value()).map(<[u8]>::to_vec)))
 }
 
 pub(crate) fn put_meta(transaction: &WriteTransaction, key: &str, value: &[u8]) -> Result<(), CommitError> {

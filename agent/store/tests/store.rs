@@ -15,6 +15,7 @@ use std::path::Path;
 const META: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("meta");
 const ENTRIES: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition::new("entries");
 const BLOBS: TableDefinition<'_, [u8; 32], &[u8]> = TableDefinition::new("blobs");
+const REFUSED: TableDefinition<'_, [u8; 32], &[u8]> = TableDefinition::new("refused");
 const PRIVATE: TableDefinition<'_, [u8; 16], &[u8]> = TableDefinition::new("private");
 
 #[test]
@@ -29,12 +30,17 @@ fn all_kinds_of_records_survive_a_restart_with_the_epoch() {
         Record::Private { submap, bytes: vec![1; 100_000] },
         Record::Fork { frame: submap.frame, proof: [b"one".to_vec(), b"other".to_vec()] },
         Record::EpochClosed { epoch: 7 },
+        Record::Session { epoch: 9, session: u64::MAX, over: vec![3, 1 << 40] },
+        refused(4, Some(u64::MAX)),
+        refused(5, Some(0)),
     ];
     let mut opened = open(&path, 77).unwrap();
     assert_eq!((opened.restored.fresh_epoch, opened.restored.records.len()), (77, 0));
     opened.store.commit(records.iter()).unwrap();
     opened.store.commit(records.iter()).unwrap(); // twice is harmless
     opened.store.commit([Record::EpochClosed { epoch: 5 }].iter()).unwrap(); // the largest counts
+    let earlier = Record::Session { epoch: 8, session: 1, over: vec![] };
+    opened.store.commit([earlier].iter()).unwrap(); // and the latest epoch's
     drop(opened);
     let again = open(&path, 76).unwrap();
     assert_eq!(again.restored.fresh_epoch, 77, "a clock that went back does not take the epoch with it");
@@ -42,6 +48,26 @@ fn all_kinds_of_records_survive_a_restart_with_the_epoch() {
     assert_eq!(again.report, merganser_store::Report::default());
     drop(again.store);
     assert_eq!(open(&path, 99).unwrap().restored.fresh_epoch, 99);
+}
+
+/// A pair of submaps that was refused, or counts no more as such.
+fn refused(index: u32, evidence: Option<u64>) -> Record {
+    let submap = |robot, index| SubmapId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 9 }, index };
+    Record::Refused { i: submap(3, index), j: submap(5, u32::MAX), evidence }
+}
+
+#[test]
+fn of_sessions_and_refusals_the_last_word_counts() {
+    let disk = Disk::default();
+    let mut store = on(&disk).store;
+    let session = |epoch, session, over: &[u64]| Record::Session { epoch, session, over: over.to_vec() };
+    store.commit([session(4, 1, &[]), refused(0, Some(1)), refused(1, Some(1)), refused(2, Some(1))].iter()).unwrap();
+    store.commit([session(5, 2, &[1]), refused(1, Some(2)), refused(2, None), refused(3, None)].iter()).unwrap();
+    drop(store);
+    let again = on(&disk);
+    let left = vec![session(5, 2, &[1]), refused(0, Some(1)), refused(1, Some(2))];
+    assert_eq!(sorted(again.restored.records), sorted(left));
+    assert_eq!(again.report, merganser_store::Report::default());
 }
 
 #[test]
@@ -106,14 +132,14 @@ fn a_later_schema_is_refused_and_left_alone() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("s.redb");
     drop(open(&path, 1).unwrap());
-    for (schema, says) in [([3, 0, 0, 0], "has schema 3"), ([0, 0, 0, 0], "schema 0")] {
+    for (schema, says) in [([5, 0, 0, 0], "has schema 5"), ([0, 0, 0, 0], "schema 0")] {
         let db = Database::open(&path).unwrap();
         let write = db.begin_write().unwrap();
         write.open_table(META).unwrap().insert("schema", &schema[..]).unwrap();
         write.commit().unwrap();
         drop(db);
         let refused = open(&path, 1).unwrap_err();
-        assert!(refused.to_string().contains(says) && refused.to_string().contains("reads 2"), "{refused}");
+        assert!(refused.to_string().contains(says) && refused.to_string().contains("reads 4"), "{refused}");
         let db = Database::open(&path).unwrap();
         let kept = db.begin_read().unwrap().open_table(META).unwrap();
         assert_eq!(kept.get("schema").unwrap().unwrap().value(), schema);
@@ -186,6 +212,31 @@ fn an_older_schema_migrates_and_what_it_could_not_seal_is_checked() {
     assert!(opened.report.entries_lost && opened.restored.records.contains(&Record::EpochClosed { epoch: 40 }));
 }
 
+/// Version 2 sealed what it wrote, but knew no refused pairs.
+#[test]
+fn a_store_of_version_2_migrates_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("s.redb");
+    let proof = [b"one".to_vec(), b"other".to_vec()];
+    let frame = FrameId { robot: RobotId([3; 8]), epoch: 9 };
+    let records = vec![entry(0, b"zero"), Record::Fork { frame, proof }, Record::EpochClosed { epoch: 7 }];
+    open(&path, 1).unwrap().store.commit(records.iter()).unwrap();
+    let db = Database::open(&path).unwrap();
+    let write = db.begin_write().unwrap();
+    write.open_table(META).unwrap().insert("schema", [2, 0, 0, 0].as_slice()).unwrap();
+    assert!(write.delete_table(REFUSED).unwrap());
+    write.commit().unwrap();
+    drop(db);
+    let opened = open(&path, 1).unwrap();
+    assert_eq!((opened.report.migrated_from, opened.report.damaged_count), (Some(2), 0));
+    assert_eq!(sorted(opened.restored.records), sorted(records));
+    let mut store = opened.store;
+    store.commit([refused(0, Some(1))].iter()).unwrap();
+    drop(store);
+    let again = open(&path, 1).unwrap();
+    assert_eq!((again.report.migrated_from, again.restored.records.len()), (None, 4));
+}
+
 #[test]
 fn a_migration_without_room_is_refused_and_loses_nothing() {
     let dir = tempfile::tempdir().unwrap();
@@ -194,7 +245,7 @@ fn a_migration_without_room_is_refused_and_loses_nothing() {
     write_version_1(&path, &bytes, [0; 16]);
     std::fs::create_dir(dir.path().join("s.redb.new")).unwrap(); // nothing can be made here
     let refused = open(&path, 1).unwrap_err();
-    assert!(refused.to_string().contains("cannot be migrated to schema 2"), "{refused}");
+    assert!(refused.to_string().contains("cannot be migrated to schema 4"), "{refused}");
     assert_eq!(inspect(&FileMedium::new(&path)).unwrap().schema, Schema::Version(1));
 }
 

@@ -301,8 +301,9 @@ impl Agent {
         match work.purpose {
             Purpose::Propose(guess) => {
                 self.tell_try(&work, guess, outcome.is_ok());
-                if let Ok(measured) = outcome {
-                    self.propose(&work, &measured);
+                match outcome {
+                    Ok(measured) => self.propose(&work, &measured),
+                    Err(_) => self.note_refusal(pair_of(work.mine, work.theirs)),
                 }
             }
             Purpose::Verify(id) => {

@@ -77,6 +77,7 @@ impl Agent {
         let blobs = gone.iter().map(|(_, blob)| *blob).filter(|blob| !kept.contains(blob)).collect();
         self.ledger.open.push(Record::Replaced { below, submaps, blobs });
         gone.iter().for_each(|(submap, _)| self.negotiation.forget(*submap));
+        self.forget_refusals(|submap| gone.binary_search_by_key(&submap, |(id, _)| *id).is_ok());
         self.stats.condensed(bytes);
         self.event(Event::Condensed { frame, parts: new.len(), submaps_gone: gone.len(), bytes });
     }

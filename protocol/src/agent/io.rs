@@ -229,6 +229,26 @@ pub enum Record {
         /// The last one closed.
         epoch: u32,
     },
+    /// What our front end calls the run that made the keyframes of this epoch: after a restart, one of another run is of
+    /// another frame. One is kept, of the largest epoch.
+    Session {
+        /// Our epoch.
+        epoch: u32,
+        /// Its run.
+        session: u64,
+        /// The last ones that are over, at most [`SESSIONS_OVER_MAX`](crate::submap::runs::SESSIONS_OVER_MAX).
+        over: Vec<u64>,
+    },
+    /// We tried a pair of submaps and could not align it: not to be tried again on the same evidence. Nothing waits for it
+    /// to be durable, since a lost one costs no more than the try.
+    Refused {
+        /// Target.
+        i: SubmapId,
+        /// Source.
+        j: SubmapId,
+        /// A digest of what was looked at, and how. `None` if the refusal counts no more: to be taken off the disk.
+        evidence: Option<u64>,
+    },
     /// What a log's writer has replaced, to be taken off the disk in the same commit.
     Replaced {
         /// The entries of its log below this one.

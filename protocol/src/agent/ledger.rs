@@ -170,9 +170,10 @@ impl Agent {
     }
 
     pub(super) fn close_batch(&mut self) {
-        if self.ledger.open.is_empty() {
+        if self.ledger.open.is_empty() && !self.refusals.are_many() {
             return;
         }
+        self.save_refusals();
         let records = core::mem::take(&mut self.ledger.open);
         self.ledger.last_batch += 1;
         let mut batch = Batch::default();

@@ -8,6 +8,7 @@ use crate::config::SubmapConfig;
 use crate::geometry::{PoseWithCovariance, Se3};
 use crate::ids::{Hash, SubmapId};
 use crate::submap::continuity::FrameSign;
+use crate::submap::runs::Runs;
 use crate::submap::{Described, Features, Keyframe, KeyframeError, Keypoints, Submap, SubmapBuilder};
 use crate::time::{Instant, Stamp};
 use crate::wire::fact::{Fact, SubmapFact};
@@ -109,11 +110,13 @@ impl Agent {
             }
         }
         let (stamp, pose) = (keyframe.stamp, keyframe.pose.pose);
+        let session = self.mapper.builder.runs().now();
         match self.mapper.builder.push(keyframe) {
             Ok(closed) => {
                 self.mapper.behind = None;
                 self.mapper.taken(&pose, stamp);
                 self.mapper.keyframes += 1;
+                self.keep_session(session);
                 self.enqueue(closed);
             }
             Err(error) => {
@@ -123,6 +126,16 @@ impl Agent {
                     self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::ClockBack);
                 }
             }
+        }
+    }
+
+    /// Once it is known what the front end calls its run, that is kept for the next start: together with the first
+    /// submap of the epoch, or before.
+    fn keep_session(&mut self, before: Option<u64>) {
+        let runs = self.mapper.builder.runs();
+        if let Some(session) = runs.now().filter(|now| Some(*now) != before) {
+            let over = runs.over().collect();
+            self.ledger.open.push(Record::Session { epoch: self.me.frame.epoch, session, over });
         }
     }
 
@@ -180,8 +193,8 @@ impl Agent {
         self.negotiation.add_features(id, Arc::new(described.features));
     }
 
-    /// After a restart: the trajectory goes on from the last submap that is durable.
-    pub(super) fn resume_mapping(&mut self) {
+    /// After a restart: the trajectory goes on from the last submap that is durable, if the front end's run does.
+    pub(super) fn resume_mapping(&mut self, runs: Runs) {
         let mut t_frame_anchor = None;
         let mut next_index = 0;
         let chain = self.knowledge.chains().remove(&self.me.frame).unwrap_or_default();
@@ -190,7 +203,7 @@ impl Agent {
             next_index = index + 1;
             t_frame_anchor = Some(t_frame_anchor.unwrap_or_else(Se3::identity) * known.t_prev_this);
         }
-        self.mapper.builder = SubmapBuilder::resume(self.config.submap.clone(), next_index, t_frame_anchor);
+        self.mapper.builder = SubmapBuilder::resume(self.config.submap.clone(), next_index, t_frame_anchor, runs);
     }
 
     pub(super) fn restore_features(&mut self, submap: SubmapId, bytes: &[u8]) {

@@ -24,6 +24,7 @@ mod mapping;
 mod negotiation;
 mod promise;
 mod ranking;
+mod refusals;
 mod shortlist;
 mod sighting;
 mod solving;
@@ -37,6 +38,7 @@ mod view;
 use crate::config::{Config, ConfigError};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
 use crate::replica::{Replica, RosterError};
+use crate::submap::runs::Runs;
 use crate::time::Instant;
 use crate::wire::fact::Fact;
 use allowance::Allowance;
@@ -51,6 +53,7 @@ use mapping::Mapper;
 use negotiation::Negotiation;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
+use refusals::Refusals;
 use sighting::Positions;
 use solving::MapState;
 use stats::Stats;
@@ -66,6 +69,7 @@ pub use mapping::CLOCK_BACK_KEYFRAMES;
 pub use negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, TRIES_PER_SUBMAP,
 };
+pub use refusals::{REFUSED_MAX, REFUSED_WAITING_MAX};
 pub use sighting::{SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
 pub use traffic::{POSTPONED_MAX, UNSENT_MAX};
 
@@ -125,6 +129,7 @@ pub struct Agent {
     knowledge: Knowledge,
     mapper: Mapper,
     negotiation: Negotiation,
+    refusals: Refusals,
     allowance: Allowance,
     gossip: Gossip,
     map: MapState,
@@ -168,6 +173,7 @@ impl Agent {
         let mut agent = Self {
             mapper: Mapper::new(&config.submap),
             negotiation: Negotiation::new(config.submap.sensor),
+            refusals: Refusals::new(&config),
             allowance: Allowance::new(config.align.further_bytes_per_sec, now.min(LATEST)),
             gossip: Gossip::new(robot, &config.gossip, now.min(LATEST)),
             me: Me { robot, frame, key, name: identity.name, swarm: identity.swarm },
@@ -205,7 +211,10 @@ impl Agent {
             Input::PersistFailed { batch: _, reason } => self.on_persist_failed(reason),
             Input::JobDone { job, result } => self.on_job_done(job, result),
             Input::Timeout => {}
-            Input::Command(Command::Flush) => self.close_submap(),
+            Input::Command(Command::Flush) => {
+                self.close_submap();
+                self.save_refusals();
+            }
             Input::Command(Command::NewEpoch) => {
                 self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::Told);
             }
@@ -254,8 +263,8 @@ impl Agent {
     fn restore(&mut self, restored: Restored) {
         let mut entries = Vec::new();
         let (mut private, mut blobs) = (Vec::new(), Vec::new());
-        let mut forks = Vec::new();
-        let mut closed = None;
+        let (mut forks, mut refused) = (Vec::new(), Vec::new());
+        let (mut closed, mut session) = (None, None);
         let fresh_epoch = restored.fresh_epoch;
         for record in restored.records {
             match record {
@@ -264,8 +273,10 @@ impl Agent {
                 Record::Private { submap, bytes } => private.push((submap, bytes)),
                 Record::Fork { proof, .. } => forks.push(proof),
                 Record::EpochClosed { epoch } => closed = closed.max(Some(epoch)),
+                Record::Session { epoch, session: now, over } => session = session.max(Some((epoch, now, over))),
+                Record::Refused { i, j, evidence: Some(evidence) } => refused.push(((i, j), evidence)),
                 // A store gives back what is there.
-                Record::Replaced { .. } => {}
+                Record::Replaced { .. } | Record::Refused { evidence: None, .. } => {}
             }
         }
         let loaded = self.replica.restore(entries);
@@ -287,6 +298,7 @@ impl Agent {
         if let Some(closed) = closed.filter(|closed| *closed >= self.me.frame.epoch) {
             self.begin_epoch(closed.saturating_add(1).max(fresh_epoch), EpochReason::Log);
         }
+        self.refusals.restore(refused);
         self.relearn();
         // Only now it is known which are ours; of others as many are taken as there is room for.
         let ours = self.knowledge.blobs_of(self.me.robot);
@@ -295,7 +307,14 @@ impl Agent {
         for (submap, bytes) in private {
             self.restore_features(submap, &bytes);
         }
-        self.resume_mapping();
+        self.resume_mapping(self.runs_of(session));
+    }
+
+    /// What is known of the front end's runs, by what was last kept of them: the epoch, its run, and those that are over.
+    fn runs_of(&self, kept: Option<(u32, u64, Vec<u64>)>) -> Runs {
+        let Some((epoch, session, over)) = kept else { return Runs::default() };
+        // An epoch that began since may be of any run that is not over.
+        Runs::remembered((epoch == self.me.frame.epoch).then_some(session), over)
     }
 
     /// A durable entry takes effect.
@@ -332,6 +351,7 @@ impl Agent {
             self.knowledge.absorb(id, fact);
         }
         calling.iter().for_each(|(id, fact)| self.on_fact(*id, fact));
+        self.weigh_refusals();
         self.note_all_candidates();
         self.map.dirty = true;
     }

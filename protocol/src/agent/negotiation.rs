@@ -240,6 +240,18 @@ impl Negotiation {
         }
     }
 
+    /// A pair that was tried in an earlier run counts as in this one.
+    pub fn restore_tried(&mut self, mine: SubmapId, theirs: SubmapId) {
+        if self.tried.len() < TRIED_MAX && self.tried.insert(pair_of(mine, theirs)) {
+            *self.tries.entry((mine, theirs.frame)).or_default() += 1;
+        }
+    }
+
+    /// What a pair's try rested on is no more: it may be tried again.
+    pub fn retry(&mut self, pair: Pair) {
+        self.tried.remove(&pair);
+    }
+
     /// Pairs tried so far of this one's own submap with this one's other frame.
     pub fn tries(&self, candidate: &Candidate) -> usize {
         self.tries.get(&(candidate.mine, candidate.theirs.frame)).copied().unwrap_or(0)

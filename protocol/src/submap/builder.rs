@@ -15,13 +15,13 @@ use super::misfit::{Misfits, Views};
 use super::odometry::{across_gap_after, isotropic, motion};
 use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
+use super::runs::Runs;
 use super::thinning::Thinner;
 use super::{Keyframe, KeyframeError, Mark, PlaceDescriptor, PoseWithCovariance};
 use crate::config::{Gravity, Sensor, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
-use std::collections::VecDeque;
 
 /// Points in one keyframe at most: four times a dense depth image of 640×480.
 pub const POINTS_PER_KEYFRAME_MAX: usize = 1 << 20;
@@ -29,8 +29,6 @@ pub const POINTS_PER_KEYFRAME_MAX: usize = 1 << 20;
 pub const POSITION_MAX: f64 = 1e7;
 /// Stamps lie within this of the clock's zero, ns (146 years): the span of any two then fits the wire.
 pub const STAMP_MAX: i64 = (1 << 62) - 1;
-/// Runs of the front end remembered as over: a keyframe of one is refused and begins no epoch.
-pub const SESSIONS_OVER_MAX: usize = 8;
 /// Standard deviation (m and rad) of the first anchor in its frame: where the frame lies is a convention, so this is
 /// small, but not so small that it spoils the conditioning of an estimate.
 pub const FIRST_ANCHOR_SIGMA: f64 = 1e-4;
@@ -77,10 +75,8 @@ pub struct SubmapBuilder {
     gap: bool,
     /// Whether keyframes go on from one another.
     continuity: Continuity,
-    /// What the front end calls its run, if it said...
-    session: Option<u64>,
-    /// ...and what it called the last runs that are over.
-    over: VecDeque<u64>,
+    /// What the front end calls its run, and what it called those that are over.
+    runs: Runs,
     /// Where the body is: as the SLAM has it, or a laser's scans.
     t_frame_body: Se3,
     sharpener: Sharpener,
@@ -121,8 +117,7 @@ impl SubmapBuilder {
             open: None,
             gap: false,
             continuity: Continuity::default(),
-            session: None,
-            over: VecDeque::new(),
+            runs: Runs::default(),
             t_frame_body: Se3::identity(),
             sharpener: Sharpener::default(),
             misfits: Misfits::default(),
@@ -134,21 +129,21 @@ impl SubmapBuilder {
     /// frame, too.
     #[must_use]
     pub fn begun_anew(&self, is_over: bool) -> Self {
-        let mut over = self.over.clone();
-        over.extend(self.session.filter(|_| is_over));
-        while over.len() > SESSIONS_OVER_MAX {
-            over.pop_front();
-        }
-        Self { over, ..Self::new(self.config.clone()) }
+        Self { runs: self.runs.begun_anew(is_over), ..Self::new(self.config.clone()) }
     }
 
-    /// A builder that goes on after a restart of the agent (not of the SLAM): submaps below `next_index` exist, the
-    /// last one anchored at `t_frame_last_anchor`. The motion since then was not observed: the next submap's odometry
-    /// takes its mean from the SLAM and its covariance from `gap_sigma_per_m`. Without the last anchor's pose the
-    /// frame's origin stands in for it.
-    pub fn resume(config: SubmapConfig, next_index: u32, t_frame_last_anchor: Option<Se3>) -> Self {
+    /// A builder that goes on after a restart of the agent (not of the SLAM: that shows by a session that is not of
+    /// `runs`): submaps below `next_index` exist, the last one anchored at `t_frame_last_anchor`. The motion since then
+    /// was not observed: the next submap's odometry takes its mean from the SLAM and its covariance from
+    /// `gap_sigma_per_m`. Without the last anchor's pose the frame's origin stands in for it.
+    pub fn resume(config: SubmapConfig, next_index: u32, t_frame_last_anchor: Option<Se3>, runs: Runs) -> Self {
         let resumed_at = (next_index > 0).then(|| t_frame_last_anchor.unwrap_or_else(Se3::identity));
-        Self { next_index, resumed_at, ..Self::new(config) }
+        Self { next_index, resumed_at, runs, ..Self::new(config) }
+    }
+
+    /// The runs of the front end, as far as they are known.
+    pub fn runs(&self) -> &Runs {
+        &self.runs
     }
 
     /// Takes the next keyframe; returns the submap that it closed, if it closed one.
@@ -165,7 +160,7 @@ impl SubmapBuilder {
             return Err(error);
         }
         self.continuity.take(&keyframe, &self.config);
-        self.session = keyframe.session.or(self.session);
+        self.runs.take(keyframe.session);
         let step = self.step(&keyframe);
         let ended = if step.as_ref().is_some_and(|step| self.would_blur(step)) { self.flush() } else { None };
         self.t_frame_body = match (&step, self.config.sensor) {
@@ -217,8 +212,8 @@ impl SubmapBuilder {
     /// `session`, or it is the last that was wanted to be sure (see [`continuity`](super::continuity)). Then it is the
     /// first to [`push`](Self::push) to a new builder.
     pub fn another_frame(&self, keyframe: &Keyframe) -> Option<FrameSign> {
-        let is_late = keyframe.stamp <= self.last.as_ref()?.stamp;
-        match (self.session, keyframe.session) {
+        let is_late = self.last.as_ref().is_some_and(|last| keyframe.stamp <= last.stamp);
+        match (self.runs.now(), keyframe.session) {
             // A session that is over may have keyframes on their way.
             (Some(before), Some(now)) if now != before => {
                 let begins = (now > before || !is_late) && self.check_alone(keyframe).is_ok();
@@ -243,9 +238,7 @@ impl SubmapBuilder {
 
     /// What no keyframe may be, whichever came before it.
     fn check_alone(&self, keyframe: &Keyframe) -> Result<(), KeyframeError> {
-        if let Some(session) = keyframe.session.filter(|session| self.over.contains(session)) {
-            return Err(KeyframeError::SessionOver { session });
-        }
+        self.runs.check(keyframe.session)?;
         if !(-STAMP_MAX..=STAMP_MAX).contains(&keyframe.stamp.0) {
             return Err(KeyframeError::StampOutOfRange { stamp: keyframe.stamp.0 });
         }

@@ -154,7 +154,7 @@ fn flush_closes_what_is_open_once() {
 
 #[test]
 fn a_restart_continues_the_numbering_and_admits_the_gap() {
-    let mut builder = SubmapBuilder::resume(config(), 7, Some(at(1.0)));
+    let mut builder = SubmapBuilder::resume(config(), 7, Some(at(1.0)), Runs::default());
     assert!(builder.body_since_anchor().is_none());
     builder.push(keyframe(100, at(3.0), &[])).unwrap();
     let (index, t_anchor_body, _) = builder.body_since_anchor().unwrap();
@@ -163,7 +163,7 @@ fn a_restart_continues_the_numbering_and_admits_the_gap() {
     let submap = builder.flush().unwrap();
     assert_eq!((submap.index, submap.odometry), (7, t_anchor_body));
     // Nothing was finished before: as new.
-    let mut fresh = SubmapBuilder::resume(config(), 0, None);
+    let mut fresh = SubmapBuilder::resume(config(), 0, None, Runs::default());
     fresh.push(keyframe(1, at(3.0), &[])).unwrap();
     let first = fresh.flush().unwrap();
     assert_eq!((first.index, first.odometry.pose), (0, at(3.0)));

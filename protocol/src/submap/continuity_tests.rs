@@ -1,4 +1,4 @@
-use super::super::builder::SESSIONS_OVER_MAX;
+use super::super::runs::SESSIONS_OVER_MAX;
 use super::super::testing::keyframe;
 use super::super::{CovarianceOf, SubmapBuilder};
 use super::*;

@@ -32,6 +32,7 @@ pub mod refine;
 mod refusal;
 pub mod register;
 mod rings;
+pub mod runs;
 mod sampling;
 mod scene;
 pub mod summary;

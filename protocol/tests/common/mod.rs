@@ -142,6 +142,8 @@ pub struct Wires {
     pub now: Instant,
     pub events: Vec<(usize, Event)>,
     pub disks: Vec<Vec<Record>>,
+    /// Of each batch that went to a disk: whose, how many records, and how many of them refused pairs.
+    pub batches: Vec<(usize, usize, usize)>,
     pub published: Vec<(usize, Channel, Vec<u8>)>,
     /// Who asked for a piece of a blob, when, and the answer.
     pub pieces: Vec<(usize, Instant, Option<Vec<u8>>)>,
@@ -156,6 +158,7 @@ impl Wires {
             now: Instant::ZERO,
             events: Vec::new(),
             disks,
+            batches: Vec::new(),
             published: Vec::new(),
             pieces: Vec::new(),
             inbox: VecDeque::new(),
@@ -206,6 +209,8 @@ impl Wires {
     fn carry(&mut self, k: usize, output: Output) {
         match output {
             Output::Persist { batch, records } => {
+                let refused = records.iter().filter(|record| matches!(record, Record::Refused { .. })).count();
+                self.batches.push((k, records.len(), refused));
                 records.into_iter().for_each(|record| put(&mut self.disks[k], record));
                 self.inbox.push_back((k, Input::Persisted { up_to: batch }));
             }
@@ -243,7 +248,13 @@ impl Wires {
 
 /// What a disk does with a record.
 fn put(disk: &mut Vec<Record>, record: Record) {
-    let Record::Replaced { below, submaps, blobs } = record else { return disk.push(record) };
+    if let Record::Refused { i, j, .. } = record {
+        disk.retain(|other| !matches!(other, Record::Refused { i: a, j: b, .. } if (*a, *b) == (i, j)));
+    }
+    let Record::Replaced { below, submaps, blobs } = record else {
+        let stays = !matches!(record, Record::Refused { evidence: None, .. });
+        return disk.extend(stays.then_some(record));
+    };
     disk.retain(|record| match record {
         Record::Entry { id, .. } => id.frame != below.frame || id.seq >= below.seq,
         Record::Private { submap, .. } => !submaps.contains(submap),

@@ -7,6 +7,7 @@ use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::{AskToken, Channel, Event, JobId, Output, QueryId, QueryKind, Record};
 use merganser_protocol::agent::job::{Job, JobResult};
 use merganser_protocol::ids::{EntryId, FrameId, RobotId};
+use merganser_protocol::submap::runs::SESSIONS_OVER_MAX;
 use merganser_protocol::wire::limits::{BLOB_LEN_MAX, ENTRY_LEN_MAX};
 use merganser_protocol::wire::{Entry, Message};
 use std::collections::{BTreeMap, BTreeSet};
@@ -72,7 +73,13 @@ impl Shell {
     }
 
     fn store(&mut self, record: Record) {
-        let Record::Replaced { below, submaps, blobs } = record else { return self.disk.push(record) };
+        if let Record::Refused { i, j, .. } = record {
+            self.disk.retain(|other| !matches!(other, Record::Refused { i: a, j: b, .. } if (*a, *b) == (i, j)));
+        }
+        let Record::Replaced { below, submaps, blobs } = record else {
+            let stays = !matches!(record, Record::Refused { evidence: None, .. });
+            return self.disk.extend(stays.then_some(record));
+        };
         self.disk.retain(|record| match record {
             Record::Entry { id, .. } => id.frame != below.frame || id.seq >= below.seq,
             Record::Private { submap, .. } => !submaps.contains(submap),
@@ -225,6 +232,8 @@ fn check_record(record: &Record) {
         }
         Record::Blob { bytes, .. } => assert!(bytes.len() <= BLOB_LEN_MAX),
         Record::Fork { proof: [a, b], .. } => assert!(a.len() + b.len() <= 2 * ENTRY_LEN_MAX && a != b),
+        Record::Session { over, .. } => assert!(over.len() <= SESSIONS_OVER_MAX),
+        Record::Refused { i, j, .. } => assert!(i < j),
         Record::Private { .. } | Record::EpochClosed { .. } | Record::Replaced { .. } => {}
     }
 }

@@ -338,6 +338,9 @@ impl<'m, M: Meter> Story<'m, M> {
                     *bytes = r.mangled(core::mem::take(bytes));
                 }
                 Record::Fork { proof, .. } => proof.swap(0, 1),
+                Record::Session { session, over, .. } => over.push(core::mem::replace(session, u64::from(r.byte()))),
+                Record::Refused { i, j, .. } if r.one_in(2) => core::mem::swap(i, j),
+                Record::Refused { evidence, .. } => *evidence = evidence.map(|evidence| evidence ^ 1),
                 Record::EpochClosed { .. } | Record::Replaced { .. } => {}
             }
             records.iter_mut().filter(|other| *other == record).for_each(|other| other.clone_from(&damaged));

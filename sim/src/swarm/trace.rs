@@ -108,6 +108,8 @@ fn records_digest(records: &[Record]) -> [u8; 32] {
             Record::Private { submap, bytes } => (format!("private {submap}"), &bytes[..]),
             Record::Fork { frame, proof } => (format!("fork {frame}"), &proof[1][..]),
             Record::EpochClosed { epoch } => (format!("closed {epoch}"), &[][..]),
+            Record::Session { epoch, session, over } => (format!("session {epoch}: {session} {over:?}"), &[][..]),
+            Record::Refused { i, j, evidence } => (format!("refused {i} {j}: {evidence:?}"), &[][..]),
             Record::Replaced { below, submaps, blobs } => (format!("below {below}: {submaps:?} {blobs:?}"), &[][..]),
         };
         for part in [kind.as_bytes(), bytes] {

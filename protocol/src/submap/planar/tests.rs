@@ -1,5 +1,6 @@
 //! Floor plans made of segments, seen by a made-up laser.
 
+use super::super::runs::Runs;
 use super::super::{CovarianceOf, Described, Keyframe, KeyframeError, RegisterError, Registered, SubmapBuilder};
 use super::flat::{Flat, in_plane, in_space};
 use super::{FlatConfig, OUT_OF_PLANE_ALIGNED, TILT_MAX, register};
@@ -182,7 +183,7 @@ fn a_tilted_body_is_refused_and_height_is_left_out() {
 #[test]
 fn a_restart_is_as_uncertain_as_the_way_before_it_was_long() {
     let sigma = |submaps: u32| {
-        let mut builder = SubmapBuilder::resume(config(), submaps, Some(Se3::identity()));
+        let mut builder = SubmapBuilder::resume(config(), submaps, Some(Se3::identity()), Runs::default());
         builder.push(keyframe(1, Se3::identity(), 0.02, vec![[1.0, 0.0, 0.0]])).unwrap();
         builder.flush().unwrap().odometry.covariance.sigmas()[0]
     };
