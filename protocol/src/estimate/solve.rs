@@ -219,12 +219,11 @@ impl<'a> System<'a> {
 
 impl Terms {
     fn new(variables: Variables, pattern: &BlockPattern) -> Self {
-        let pairs = variables.pairs();
-        let slots = || pairs.iter().map(|&(a, b)| pattern.slot(a, b)).collect();
-        let parts = match variables {
+        let slots = |variables: &Variables| variables.pairs().iter().map(|&(a, b)| pattern.slot(a, b)).collect();
+        let parts = match &variables {
             Variables::Bent(nodes) => {
                 let start = |node: &usize| node.checked_sub(1).map(|variable| pattern.start(variable));
-                return Self::Bent { starts: nodes.iter().map(start).collect(), slots: slots() };
+                return Self::Bent { starts: nodes.iter().map(start).collect(), slots: slots(&variables) };
             }
             Variables::Of(parts) => parts,
         };
@@ -239,7 +238,10 @@ impl Terms {
                 cross: j.zip(i).map(|(a, b)| pattern.slot(a, b)),
             });
         }
-        Self::General { slots: slots(), parts: parts.into_iter().map(|(v, part)| (pattern.start(v), part)).collect() }
+        Self::General {
+            slots: slots(&variables),
+            parts: parts.iter().map(|(v, part)| (pattern.start(*v), *part)).collect(),
+        }
     }
 }
 
