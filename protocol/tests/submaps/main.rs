@@ -8,11 +8,11 @@ mod measure;
 mod world;
 
 use data::{Place, Set};
-use measure::{Score, median, overlap, pairs, trial};
+use measure::{CHI2_6_95, Score, median, overlap, pairs, trial};
 use merganser_protocol::config::Sensor;
-use merganser_protocol::geometry::Se3;
+use merganser_protocol::geometry::{PoseWithCovariance, Se3};
 use merganser_protocol::submap::{RefineConfig, RefineError, refine};
-use nalgebra::Vector6;
+use nalgebra::{Vector3, Vector6};
 use world::World;
 
 /// Keypoints that fit a blob of 7 kB, and the default number.
@@ -101,13 +101,43 @@ fn a_corridor_is_refused_however_it_is_shifted_along() {
     let set = World::corridor().set("corridor", 6, [1.0, 0.5], 0.002, 3);
     for (theirs, mine, truth) in pairs(&set) {
         for shift in [0.0, 0.3] {
-            let along = theirs.t_world_anchor.rotation.inverse() * nalgebra::Vector3::x();
+            let along = theirs.t_world_anchor.rotation.inverse() * Vector3::x();
             let rough =
                 truth * Se3::exp(&Vector6::new(along.x * shift, along.y * shift, along.z * shift, 0.0, 0.0, 0.0));
             let (keypoints, features) = (&theirs.described.keypoints, &mine.described.features);
             let refused = refine(keypoints, features, &rough, &RefineConfig::default()).unwrap_err();
             assert!(matches!(refused, RefineError::Degenerate { .. }), "{refused}");
         }
+    }
+}
+
+/// The fewer things tell how far along a corridor one is, the less sure an alignment is along it.
+#[test]
+fn a_corridor_with_little_in_it_stays_uncertain_along_its_axis() {
+    let mut before = f64::INFINITY;
+    for cupboards in [1, 2, 4] {
+        let set = World::furnished_corridor(cupboards).set("furnished corridor", 8, [1.0, 0.5], 0.002, 3);
+        let (mut along, mut across, mut covered) = (vec![], vec![], 0);
+        for (theirs, mine, truth) in pairs(&set) {
+            let (keypoints, features) = (&theirs.described.keypoints, &mine.described.features);
+            let Ok(refined) = refine(keypoints, features, &truth, &RefineConfig::default()) else { continue };
+            let PoseWithCovariance { pose, covariance } = refined.pose;
+            let position = covariance.matrix().fixed_view::<3, 3>(0, 0).into_owned();
+            let sigma = |axis: &Vector3<f64>| {
+                let axis = theirs.t_world_anchor.rotation.inverse() * *axis;
+                axis.dot(&(position * axis)).sqrt()
+            };
+            along.push(sigma(&Vector3::x()));
+            across.push(sigma(&Vector3::y()));
+            covered += usize::from(covariance.mahalanobis_squared(&truth.local(&pose)) < CHI2_6_95);
+        }
+        let (refined, along, across) = (along.len(), median(&along), median(&across));
+        println!(
+            "{cupboards} cupboards: {refined} refined, {covered} inside 95 %, σ {along:.4} m along, {across:.4} across"
+        );
+        assert!(refined >= 20 && covered * 10 >= refined * 9);
+        assert!(along > 2.0 * across && along < before, "{along} m along, {across} across, {before} with fewer");
+        before = along;
     }
 }
 

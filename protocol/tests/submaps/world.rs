@@ -38,6 +38,18 @@ impl World {
         Self { boxes: vec![[Vector3::new(-100.0, -1.0, 0.0), Vector3::new(100.0, 1.0, 2.5)]], pillars: vec![] }
     }
 
+    /// A corridor four metres wide whose ends are beyond the sensor's range, and so many cupboards in it, which alone tell
+    /// how far along it one is.
+    pub fn furnished_corridor(cupboards: usize) -> Self {
+        let walls = [Vector3::new(-100.0, -2.0, 0.0), Vector3::new(100.0, 2.0, 2.5)];
+        let cupboard = |k: usize| {
+            // Never two at the same distance, on both sides by turns.
+            let (at, side) = (-3.0 + 2.3 * k as f64, if k % 2 == 0 { 1.25 } else { -2.0 });
+            [Vector3::new(at, side, 0.0), Vector3::new(at + 0.9, side + 0.75, 2.0)]
+        };
+        Self { boxes: std::iter::once(walls).chain((0..cupboards).map(cupboard)).collect(), pillars: vec![] }
+    }
+
     fn is_free(&self, p: &Vector3<f64>) -> bool {
         let inside =
             |b: &[Vector3<f64>; 2], margin: f64| (0..2).all(|k| p[k] > b[0][k] - margin && p[k] < b[1][k] + margin);
