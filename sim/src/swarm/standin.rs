@@ -24,6 +24,7 @@ pub struct StandIn {
 /// Where a submap's cloud truly lies, and what all its alignments err by alike, in standard deviations of one.
 #[derive(Clone, Copy, Debug)]
 struct Place {
+    features: Hash,
     t_world_anchor: Se3,
     bent: Vector6<f64>,
 }
@@ -43,7 +44,7 @@ impl StandIn {
                 if let (JobResult::Described(described), Some(t_world_anchor)) = (&result, t_world_anchor) {
                     let features = Hash::of(&described.1.features.encode());
                     let mut dice = Dice::new(self.seed, &format!("bent {features}"));
-                    let place = Place { t_world_anchor, bent: Vector6::from_fn(|_, _| dice.normal()) };
+                    let place = Place { features, t_world_anchor, bent: Vector6::from_fn(|_, _| dice.normal()) };
                     self.places.insert(features, place);
                     self.places.insert(Hash::of(&described.1.keypoints.encode()), place);
                 }
@@ -72,7 +73,10 @@ impl StandIn {
         if truth.translation.norm() > self.options.reach_m {
             return Err(RefusalReason::NoConsensus);
         }
-        let mut dice = Dice::new(self.seed, &format!("align {}", job.seed));
+        // Whoever looks, and in whatever order: what both ends find is the same, or their mean would err by less than it says.
+        let (first, second) = (mine.features.min(theirs.features), mine.features.max(theirs.features));
+        let mut dice = Dice::new(self.seed, &format!("align {first} {second}"));
+        let side = if mine.features == first { 1.0 } else { -1.0 };
         let [t, r] = self.options.sigma;
         let sigmas = Vector6::from([t, t, t, r, r, r]);
         let variance = Matrix6::from_diagonal(&sigmas.component_mul(&sigmas));
@@ -81,7 +85,7 @@ impl StandIn {
         // turns about its anchor, and moves the other by the lever between them.
         let t_theirs_between = truth.inverse().interpolate(&Se3::identity(), 0.5);
         let noise =
-            t_theirs_between.adjoint() * sigmas.map(|sigma| sigma * dice.normal() * (1.0 - 2.0 * common).sqrt());
+            t_theirs_between.adjoint() * sigmas.map(|sigma| side * sigma * dice.normal() * (1.0 - 2.0 * common).sqrt());
         let bent = |place: &Place| Se3::exp(&(place.bent.component_mul(&sigmas) * common.sqrt()));
         let mut pose = bent(mine).inverse() * truth * bent(theirs) * Se3::exp(&noise);
         let seen_from = |lever: &Matrix6<f64>, share: f64| lever * variance * lever.transpose() * share;
@@ -175,6 +179,19 @@ mod tests {
             let [mine, theirs] = [0.0, 2.0].map(|x| described(&mut standin, points, x));
             assert_eq!(align(&mut standin, &mine, &theirs, 1).is_ok(), aligned, "{points} points");
         }
+    }
+
+    #[test]
+    fn both_ends_find_the_same() {
+        let mut standin = StandIn::new(SummaryOptions { common: 0.2, ..SummaryOptions::default() }, 1);
+        let [one, other] = [0.0, 2.0].map(|x| described(&mut standin, 100, x));
+        let [there, back] = [(&one, &other, 1), (&other, &one, 2)].map(|(mine, theirs, seed)| {
+            let found = align(&mut standin, mine, theirs, seed).unwrap().t_mine_theirs;
+            found.metric().unwrap().pose
+        });
+        let truth = Se3::new(Se3::identity().rotation, [2.0, 0.0, 0.0].into());
+        let (apart, off) = ((there * back).log().norm(), truth.local(&there).norm());
+        assert!(off > 0.005 && apart < 0.05 * off, "{apart} apart, {off} off");
     }
 
     #[test]
