@@ -242,6 +242,14 @@ impl Scenario {
             range(key, value, 0.0, 100.0, "use 0 to 100")?;
         }
         range("world.cell_m", w.cell_m, 2.0, 100.0, "use 2 to 100 m")?;
+        for (key, set, needs, mend) in [
+            ("world.aisles", w.aisles, w.aliased && !w.streets, "set world.aliased too, and no streets"),
+            ("world.rooms", w.rooms, w.aisles, "set world.aisles too"),
+        ] {
+            if set && !needs {
+                return Err(ScenarioError::Value { key: key.to_owned(), value: set.to_string(), mend });
+            }
+        }
         range("drive.speed_m_s", d.speed_m_s, 0.01, 100.0, "use 0.01 to 100 m/s")?;
         range("drive.keyframe_m", d.keyframe_m, 0.05, 100.0, "use 0.05 to 100 m")?;
         range("drive.tilt_deg", d.tilt_deg, 0.0, 30.0, "use 0 to 30 degrees")?;
@@ -347,6 +355,9 @@ mod tests {
             ("[sensor]\ngravity_sigma_deg = 0.05", "sensor.gravity_sigma_deg = 0.05", "0.06 to 28"),
             ("[sensor]\ngravity_sigma_deg = 28.1", "sensor.gravity_sigma_deg = 28.1", "0.06 to 28"),
             ("[config.submap]\nvoxel_m = 0.0", "config.submap.voxel_m = 0", "0.001 to 10"),
+            ("[world]\naisles = true", "world.aisles = true", "aliased too"),
+            ("[world]\naliased = true\nstreets = true\naisles = true", "world.aisles = true", "no streets"),
+            ("[world]\naliased = true\nrooms = true", "world.rooms = true", "aisles too"),
             ("[config]\nvoxel = 1", "voxel", "unknown field"),
             ("[landmarks]", "config.submap.sensor = Points3d", "go together"),
             ("[config.submap]\nsensor = \"landmarks\"", "config.submap.sensor = Landmarks", "go together"),

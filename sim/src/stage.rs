@@ -49,7 +49,7 @@ pub enum StageError {
 }
 
 impl Stage {
-    /// Sets the stage; each robot drives a loop of its own.
+    /// Sets the stage; each robot drives a loop of its own, or along an aisle.
     ///
     /// # Errors
     /// [`StageError`] if the drift options are out of any covariance's range.
@@ -57,6 +57,10 @@ impl Stage {
         let options = &scenario.world;
         let path = |robot: usize| {
             let mut dice = Dice::new(seed, &format!("path {robot}"));
+            if options.aisles {
+                let length = scenario.drive.speed_m_s * scenario.duration_secs;
+                return Path::of_aisle(robot, options.cell_m, length, &mut dice);
+            }
             Path::of_robot(robot, options.loop_radius_m, options.loop_spread_m, &mut dice)
         };
         let paths: Vec<Path> = (0..scenario.robots).map(path).collect();

@@ -298,6 +298,7 @@ impl Agent {
         let Some(work) = self.negotiation.running.remove(&job) else { return };
         self.negotiation.stir();
         self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
+        let outcome = self.unless_repeated(&work, outcome);
         match work.purpose {
             Purpose::Propose(guess) => {
                 self.tell_try(&work, guess, outcome.is_ok());
@@ -318,6 +319,30 @@ impl Agent {
                 self.write_verdict(id, verdict);
             }
         }
+    }
+
+    /// What was found, unless so much was found several times with the other frame, or in our own, that it says nothing.
+    fn unless_repeated(
+        &mut self,
+        work: &Work,
+        outcome: Result<Box<Measured>, RefusalReason>,
+    ) -> Result<Box<Measured>, RefusalReason> {
+        let (ours, theirs) = (work.mine.frame, work.theirs.frame);
+        let outcomes = &mut self.negotiation.outcomes;
+        match &outcome {
+            Ok(_) => outcomes.note(theirs, true),
+            Err(RefusalReason::Ambiguous) => outcomes.note(theirs, false),
+            Err(_) => {}
+        }
+        // What contradicts our own odometry tells by itself.
+        if outcome.is_ok()
+            && !self.is_loop(work.mine, work.theirs)
+            && [ours, theirs].iter().any(|f| self.negotiation.outcomes.repeats(*f))
+        {
+            self.stats.worked("repeated");
+            return Err(RefusalReason::Ambiguous);
+        }
+        outcome
     }
 
     fn tell_try(&mut self, work: &Work, guess: Guess, found: bool) {

@@ -295,7 +295,7 @@ impl AlignJob {
     fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, RefusalReason> {
         let found = found.map_err(|error| match error {
             RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. } => RefusalReason::NoConsensus,
-            RegisterError::Ambiguous { .. } => RefusalReason::Ambiguous,
+            RegisterError::Ambiguous { .. } | RegisterError::Lookalike { .. } => RefusalReason::Ambiguous,
             RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate,
             RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit,
             RegisterError::Refine(_) => RefusalReason::NoConsensus,

@@ -25,6 +25,7 @@ mod negotiation;
 mod promise;
 mod ranking;
 mod refusals;
+pub mod repeats;
 mod shortlist;
 mod sighting;
 mod solving;

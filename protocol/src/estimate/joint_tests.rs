@@ -299,6 +299,39 @@ fn frames_of_places_that_repeat_themselves_are_ambiguous() {
     assert_eq!(status(&[((0, 1), 4), ((0, 2), 3)]), [ambiguous, merged, merged]);
 }
 
+/// Whoever takes two places of its own for one cannot tell those of others.
+#[test]
+fn a_frame_that_takes_its_places_for_others_merges_with_none() {
+    let rng = &mut rng(43);
+    let mut world = World::new(rng, 3, 12, false);
+    world.align_all(rng, 5, false);
+    let (merged, ambiguous) = ((PairStatus::Merged, 5), (PairStatus::Ambiguous, 0));
+    // Closures of the first frame: as found at the same place, though the way between is long; true; and off by a share of
+    // the way, as where odometry is worse than it says.
+    let status = |elsewhere: usize, held: usize, drifted: usize| {
+        let mut problem = world.problem.clone();
+        let mut close = |k: usize, t_i_j: Se3| {
+            let t_i_j = Relative::Metric(PoseWithCovariance { pose: t_i_j, covariance: sigmas(0.02, 0.005) });
+            let entry = EntryId { frame: frame(0), seq: 1000 + problem.alignments.len() as u32 };
+            problem.alignments.push(AgreedAlignment { entry, i: submap(0, k), j: submap(0, k + 6), t_i_j });
+        };
+        let truth = |k: usize| world.truth[&submap(0, k)].inverse() * world.truth[&submap(0, k + 6)];
+        (0..elsewhere).for_each(|k| close(k, Se3::identity()));
+        (elsewhere..elsewhere + held).for_each(|k| close(k, truth(k)));
+        let off = |k| truth(k) * Se3::new(Se3::identity().rotation, Vector3::new(0.5, 0.0, 0.0));
+        (elsewhere + held..elsewhere + held + drifted).for_each(|k| close(k, off(k)));
+        let map = solve_map(&problem, &EstimateConfig::default());
+        let refused = map.edges().iter().filter(|e| matches!(e.unused, Some(Unused::Odometry(_)))).count();
+        assert_eq!(refused, elsewhere + drifted);
+        map.pairs().iter().map(|pair| (pair.status, pair.used)).collect::<Vec<_>>()
+    };
+    assert_eq!(status(0, 0, 0), [merged; 3]);
+    assert_eq!(status(1, 0, 0), [merged; 3], "one may be chance");
+    assert_eq!(status(2, 0, 0), [ambiguous, ambiguous, merged]);
+    assert_eq!(status(2, 3, 0), [merged; 3], "most were right");
+    assert_eq!(status(0, 0, 3), [merged; 3], "no place is taken for another");
+}
+
 /// Two frames in metres that only one of unknown unit ties together: to it they have one and the same scale.
 #[test]
 fn frames_in_metres_share_the_metre_whoever_joins_them() {

@@ -9,7 +9,7 @@ use super::joint::Unused;
 use super::reweight::CHI2_999;
 use super::trajectory::Trajectory;
 use super::ways::{Way, Ways, compose, inverse};
-use crate::geometry::{Covariance, PoseWithCovariance};
+use crate::geometry::{Covariance, PoseWithCovariance, Se3};
 use crate::ids::FrameId;
 use std::collections::BTreeMap;
 
@@ -17,6 +17,9 @@ use std::collections::BTreeMap;
 const CLOSURES_COMPARED_MAX: usize = 256;
 /// Others that one of them is compared with at most: a false one contradicts most of these as it does most of all.
 const COMPARISONS_MAX: usize = 32;
+
+/// Drift is less than this share of the way, even of odometry that is worse than it says.
+const ELSEWHERE_SHARE: f64 = 0.25;
 
 /// One closure with `i < j`.
 struct Closure {
@@ -26,8 +29,28 @@ struct Closure {
     t_i_j: PoseWithCovariance,
 }
 
-/// Sets aside the loop closures that do not hold.
-pub(super) fn gate(intake: &mut Intake) {
+impl Closure {
+    /// Whether it is off from the odometry by so much of the way between its ends that it closes no loop: it took one place
+    /// for another.
+    fn is_elsewhere(&self, t_i_j: &Se3, trajectory: &Trajectory) -> bool {
+        let anchors: Vec<Se3> = (self.i..=self.j).filter_map(|k| trajectory.pose(k)).collect();
+        let way: f64 = anchors.windows(2).map(|step| (step[1].translation - step[0].translation).norm()).sum();
+        (self.t_i_j.pose.translation - t_i_j.translation).norm() > ELSEWHERE_SHARE * way
+    }
+}
+
+/// What became of the loop closures of one frame.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Loops {
+    /// The odometry between their ends agrees.
+    pub(super) held: usize,
+    /// It refutes them, by more than drift could be.
+    pub(super) refuted: usize,
+}
+
+/// Sets aside the loop closures that do not hold, and tells of each frame what became of them.
+pub(super) fn gate(intake: &mut Intake) -> BTreeMap<FrameId, Loops> {
+    let mut loops = BTreeMap::new();
     let mut by_frame: BTreeMap<FrameId, Vec<Closure>> = BTreeMap::new();
     for (edge, e) in intake.edges.iter().enumerate() {
         let m = &e.measurement;
@@ -43,21 +66,24 @@ pub(super) fn gate(intake: &mut Intake) {
     }
     for (frame, mut closures) in by_frame {
         let chain = &intake.chains[&frame];
-        let mut refused = Vec::new();
+        let (mut refused, mut refuted) = (Vec::new(), 0);
         closures.retain(|c| {
             let odometry = chain.trajectory.relative(c.i, c.j);
-            let distance = odometry.map_or(f64::INFINITY, |t| t.distance_squared(&c.t_i_j));
+            let distance = odometry.as_ref().map_or(f64::INFINITY, |t| t.distance_squared(&c.t_i_j));
             let good = distance <= CHI2_999[5];
             if !good {
                 refused.push((c.edge, Unused::Odometry(distance)));
+                refuted += usize::from(odometry.is_some_and(|t| c.is_elsewhere(&t.pose, &chain.trajectory)));
             }
             good
         });
+        loops.insert(frame, Loops { held: closures.len(), refuted });
         refused.extend(outvoted(&chain.trajectory, &closures).into_iter().map(|edge| (edge, Unused::OtherLoops)));
         for (edge, reason) in refused {
             intake.edges[edge].refuse(reason);
         }
     }
+    loops
 }
 
 /// Edges of the closures to be left out so that the rest agree with those that they are compared with.

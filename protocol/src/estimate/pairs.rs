@@ -8,14 +8,14 @@
 use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
 use super::intake::{Chain, Intake, Kind};
 use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
-use super::loops;
+use super::loops::{self, Loops};
 use super::marginals::is_rigid;
 use super::reweight::CHI2_9999;
 use crate::config::EstimateConfig;
 use crate::geometry::{Disagreement, Relative, Sim3};
 use crate::ids::{FrameId, SubmapId};
 use crate::snapshot::PairStatus;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Alignments of one pair that its consensus weighs against one another. More say little more about the frames, and
 /// cost the cube of their number; the others wait for the map, which tells the good ones better than a pair could.
@@ -23,7 +23,11 @@ const WEIGHED_MAX: usize = 32;
 
 /// With so many pairs of submaps ambiguous for each alignment that is used, the frames are. Measured in simulated halls: where
 /// every shelf is the same, false merges had 1 to 2.3; elsewhere LiDARs have up to 0.2 and landmarks up to 0.7.
-const AMBIGUOUS_SHARE: f64 = 0.8;
+pub const AMBIGUOUS_SHARE: f64 = 0.8;
+
+/// Loop closures of one frame that its odometry refutes, from which on they tell of a place that repeats itself: one may be
+/// chance.
+const REFUTED_MIN: usize = 2;
 
 /// A pair of frames, `a < b`, and what its own alignments say.
 pub(super) struct Pair {
@@ -53,7 +57,7 @@ pub(super) struct Outcome {
 
 /// Runs the consensus on every pair, and marks the intake's edges accordingly.
 pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pair> {
-    loops::gate(intake);
+    let repeat = repeating(&loops::gate(intake));
     let mut members: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
     for (k, edge) in intake.edges.iter().enumerate() {
         let (i, j) = (edge.measurement.i.frame, edge.measurement.j.frame);
@@ -64,7 +68,12 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
     let pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
         let weighed = weighed(intake, (a, b), &members, config);
         let outcome = decide(intake, (a, b), &weighed, config);
-        let outcome = outcome.unless_ambiguous(intake.ambiguous.get(&(a, b)).copied().unwrap_or(0), members.len());
+        let ambiguous = intake.ambiguous.get(&(a, b)).copied().unwrap_or(0);
+        let outcome = if repeat.contains(&a) || repeat.contains(&b) {
+            outcome.unless_merged()
+        } else {
+            outcome.unless_ambiguous(ambiguous, members.len())
+        };
         Pair { a, b, members, weighed, outcome, contradicts_loop: false, in_tree: false }
     };
     let mut pairs: Vec<Pair> = members.into_iter().map(pair).collect();
@@ -73,6 +82,13 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
     }
     span(intake, &mut pairs);
     pairs
+}
+
+/// Frames in which about as many places were taken for others, as their odometry tells, as were seen again: what looks the
+/// same there is not.
+fn repeating(loops: &BTreeMap<FrameId, Loops>) -> BTreeSet<FrameId> {
+    let repeats = |of: &Loops| of.refuted >= REFUTED_MIN && of.refuted as f64 >= AMBIGUOUS_SHARE * of.held as f64;
+    loops.iter().filter(|(_, of)| repeats(of)).map(|(frame, _)| *frame).collect()
 }
 
 /// `t_world_anchor` of every anchor: odometry, laid out along the spanning forest. Where a tree holds a frame in metres the
@@ -265,7 +281,12 @@ impl Outcome {
     fn unless_ambiguous(self, ambiguous: usize, members: usize) -> Self {
         let waiting = members.saturating_sub(WEIGHED_MAX);
         let speak_for_it = (self.used.len() + waiting) as f64;
-        if self.status == PairStatus::Merged && ambiguous as f64 >= AMBIGUOUS_SHARE * speak_for_it {
+        if ambiguous as f64 >= AMBIGUOUS_SHARE * speak_for_it { self.unless_merged() } else { self }
+    }
+
+    /// Ambiguous, if it is to be merged.
+    fn unless_merged(self) -> Self {
+        if self.status == PairStatus::Merged {
             return Self { status: PairStatus::Ambiguous, used: Vec::new(), t_a_b: None, ..self };
         }
         self

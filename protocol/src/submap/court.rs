@@ -85,8 +85,12 @@ pub struct Judged {
 impl Judged {
     /// Share of contradictions among what I can judge.
     pub fn contradiction(&self) -> f64 {
-        let confirmed = self.confirmed.iter().filter(|&&c| c).count();
-        self.contradicted as f64 / (self.contradicted + confirmed).max(1) as f64
+        self.contradicted as f64 / (self.contradicted + self.confirmed()).max(1) as f64
+    }
+
+    /// Number of points that lie on my surface.
+    pub fn confirmed(&self) -> usize {
+        self.confirmed.iter().filter(|&&c| c).count()
     }
 }
 
@@ -95,7 +99,7 @@ pub struct Court<'a> {
     theirs: &'a Cloud,
     mine: &'a Cloud,
     matches: &'a [Pairing],
-    scene: Scene,
+    scene: &'a Scene,
     /// Of their keypoints.
     middle: Vector3<f64>,
     /// Poses that tell what chance does, and what they confirm.
@@ -106,7 +110,7 @@ pub struct Court<'a> {
 
 impl<'a> Court<'a> {
     /// About to judge `poses`, each of which tells what chance does to the others.
-    pub fn new(theirs: &'a Cloud, mine: &'a Cloud, matches: &'a [Pairing], scene: Scene, poses: &[Pose]) -> Self {
+    pub fn new(theirs: &'a Cloud, mine: &'a Cloud, matches: &'a [Pairing], scene: &'a Scene, poses: &[Pose]) -> Self {
         let middle = theirs.points.iter().sum::<Vector3<f64>>() / theirs.points.len().max(1) as f64;
         let stride = poses.len().div_ceil(CHANCE_MAX).max(1);
         let confirms = |pose: &Pose| -> Vec<bool> {
@@ -118,6 +122,12 @@ impl<'a> Court<'a> {
         let chance: Vec<_> = witnesses.map(|pose| (pose, confirms(&pose))).collect();
         let often = often(theirs.points.len(), chance.iter().map(|(_, confirms)| confirms));
         Self { theirs, mine, matches, scene, middle, chance, often }
+    }
+
+    /// About to judge `poses` by other matches; what was told of chance still holds.
+    pub fn with<'b>(&'b self, matches: &'b [Pairing], poses: &[Pose]) -> Court<'b> {
+        let all: Vec<Pose> = self.chance.iter().map(|(pose, _)| *pose).chain(poses.iter().copied()).collect();
+        Court::new(self.theirs, self.mine, matches, self.scene, &all)
     }
 
     /// The most promising poses, polished and judged, best first.
@@ -163,7 +173,12 @@ impl<'a> Court<'a> {
 
     /// Whether two poses differ so much that at most one of them is right.
     pub fn rivals(&self, a: &Pose, b: &Pose) -> bool {
-        a.differs(b, &self.middle, RIVAL.0, RIVAL.1)
+        self.differ(a, b, RIVAL.0, RIVAL.1)
+    }
+
+    /// Whether two poses put their middle farther apart than `distance` (voxels) or turn it by more than `angle` (rad).
+    pub fn differ(&self, a: &Pose, b: &Pose, distance: f64, angle: f64) -> bool {
+        a.differs(b, &self.middle, distance, angle)
     }
 
     /// Confirmed points of some, less contradicted ones.
@@ -227,8 +242,7 @@ impl Court<'_> {
     /// The best score of the surfaces if the pose is slid along the direction that fewest of them face, or turned about
     /// their middle: what may be done to it unpunished is not known. All of it where they face one way only.
     pub fn slid(&self, best: &Judged) -> f64 {
-        let faces = best.confirmed.iter().zip(&self.theirs.normals).filter(|(confirmed, _)| **confirmed);
-        let spread: Matrix3<f64> = faces.map(|(_, n)| best.pose.rotation * n).map(|n| n * n.transpose()).sum();
+        let spread = self.faces(best);
         let upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].map(|at| spread[at]);
         let Some((axis, _)) = least_axis(&upper) else { return best.surface };
         let placed = best.confirmed.iter().zip(&self.theirs.points).filter(|(confirmed, _)| **confirmed);
@@ -239,6 +253,19 @@ impl Court<'_> {
             [Vector3::x(), Vector3::y(), Vector3::z()].map(|axis| turned(&best.pose, &middle, &(axis * *by)))
         });
         slides.chain(turns).map(|pose| self.close_look(pose).surface).fold(0.0, f64::max)
+    }
+
+    /// Of the points that confirm a pose, the share that faces the direction which fewest do: a third at best, nothing on a
+    /// plane.
+    pub fn least_facing(&self, judged: &Judged) -> f64 {
+        let spread = self.faces(judged);
+        spread.symmetric_eigenvalues().min() / spread.trace().max(1.0)
+    }
+
+    /// Which ways the points that confirm a pose face: the sum of n nᵀ, in my frame.
+    fn faces(&self, judged: &Judged) -> Matrix3<f64> {
+        let confirmed = judged.confirmed.iter().zip(&self.theirs.normals).filter(|(confirmed, _)| **confirmed);
+        confirmed.map(|(_, n)| judged.pose.rotation * n).map(|n| n * n.transpose()).sum()
     }
 
     /// Matches that agree with the pose: one a keypoint, and one a feature of mine.

@@ -70,6 +70,16 @@ impl Pairings {
 
 /// Finds the counterparts of each of their keypoints among my features, which lie at `my_points`.
 pub fn pair_up(theirs: &Keypoints, mine: &Features, my_points: &[Vector3<f64>]) -> Pairings {
+    pair_up_except(theirs, mine, my_points, |_, _| false)
+}
+
+/// The same, without pairs of a keypoint and a feature, by their positions, that are to be left out.
+pub fn pair_up_except(
+    theirs: &Keypoints,
+    mine: &Features,
+    my_points: &[Vector3<f64>],
+    is_out: impl Fn(usize, usize) -> bool,
+) -> Pairings {
     let arch = Arch::new();
     let apart = (APART_VOXELS * mine.voxel()) * (APART_VOXELS * mine.voxel());
     let my_codes = mine.codes();
@@ -80,13 +90,15 @@ pub fn pair_up(theirs: &Keypoints, mine: &Features, my_points: &[Vector3<f64>]) 
     let mut shortlist: Vec<(i32, u32)> = Vec::with_capacity(my_codes.len());
     for (their, code) in (0u32..).zip(theirs.codes()) {
         wide(arch, || compare(&code, my_codes, &mut distances));
+        let left_out = distances.iter_mut().enumerate().filter(|(my, _)| is_out(their as usize, *my));
+        left_out.for_each(|(_, distance)| *distance = i32::MAX);
         likes.iter_mut().zip(&distances).for_each(|(like, &distance)| {
             if distance < like.0 {
                 *like = (distance, their);
             }
         });
         shortlist.clear();
-        shortlist.extend(distances.iter().copied().zip(0u32..));
+        shortlist.extend(distances.iter().copied().zip(0u32..).filter(|(distance, _)| *distance < i32::MAX));
         if shortlist.len() > SHORTLIST {
             shortlist.select_nth_unstable(SHORTLIST - 1);
             shortlist.truncate(SHORTLIST);

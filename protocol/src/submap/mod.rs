@@ -22,6 +22,7 @@ pub mod gravity;
 mod grid;
 mod hypotheses;
 pub mod landmarks;
+mod lookalike;
 mod matching;
 mod misfit;
 mod near;

@@ -10,12 +10,14 @@
 //! point costs `CONTRADICTION_COST`, a match that agrees gains `SUPPORT_GAIN`.
 //!
 //! **Acceptance.** Score, share of keypoints near my surface, share of contradictions; and no other pose with nearly the
-//! same score that would itself pass, else the answer is *ambiguous*.
+//! same score that would itself pass, nor one elsewhere that nothing contradicts (`lookalike`), else the answer is
+//! *ambiguous*.
 
 use super::court::{Court, Judged};
 use super::features::{Features, Keypoints, in_voxels};
 use super::gravity::Verticals;
 use super::hypotheses::hypotheses;
+use super::lookalike;
 use super::matching::pair_up;
 use super::refine::{RefineConfig, RefineError, Refined, refine_anchored};
 use super::scene::{Cloud, Pose, Scene};
@@ -122,6 +124,17 @@ pub enum RegisterError {
         /// Of the other.
         rival: f64,
     },
+    /// Nothing speaks against another pose that is far from the best one.
+    #[error(
+        "{support} matches support one pose, {rival} another, far from it, that nothing contradicts: the place looks like \
+         another"
+    )]
+    Lookalike {
+        /// Matches that agree with the best pose.
+        support: usize,
+        /// Of those with what lies elsewhere, those that agree with the other.
+        rival: usize,
+    },
     /// The two clouds were thinned so differently that they show different things.
     #[error("their cloud is thinned to {ratio:.3} times my voxel; set submap.voxel_m alike on all robots")]
     Thinning {
@@ -172,7 +185,8 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     }
     // The others still tell what chance does.
     let upright = |pose: &Pose, sigma| config.verticals.is_none_or(|known| known.allow(&pose.rotation, sigma));
-    let court = Court::new(&their_cloud, &my_cloud, &pairings.all, Scene::new(mine), &poses);
+    let scene = Scene::new(mine);
+    let court = Court::new(&their_cloud, &my_cloud, &pairings.all, &scene, &poses);
     poses.retain(|pose| upright(pose, TILT_SIGMAS[0]));
     let count = poses.len();
     let mut judged = court.judge(&poses);
@@ -192,6 +206,11 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     let ambiguous = RegisterError::Ambiguous { score: best.score, rival };
     if rival >= config.rival_ratio * best.score {
         return Err(ambiguous);
+    }
+    let (theirs_seen, mine_seen) = ((theirs, &their_cloud), (mine, &my_cloud, my_points.as_slice()));
+    let tilted = |pose: &Pose| upright(pose, TILT_SIGMAS[0]);
+    if let Some(rival) = lookalike::rival(theirs_seen, mine_seen, &court, best, tilted) {
+        return Err(RegisterError::Lookalike { support: best.support.len(), rival: rival.support.len() });
     }
     let anchors = best
         .support

@@ -9,9 +9,10 @@ mod world;
 
 use data::{Place, Set};
 use measure::{CHI2_6_95, Score, median, overlap, pairs, trial};
+use merganser_protocol::align::SolverConfig;
 use merganser_protocol::config::Sensor;
 use merganser_protocol::geometry::{PoseWithCovariance, Se3};
-use merganser_protocol::submap::{RefineConfig, RefineError, refine};
+use merganser_protocol::submap::{RefineConfig, RefineError, RegisterConfig, RegisterError, refine, register};
 use nalgebra::{Vector3, Vector6};
 use world::World;
 
@@ -139,6 +140,39 @@ fn a_corridor_with_little_in_it_stays_uncertain_along_its_axis() {
         assert!(along > 2.0 * across && along < before, "{along} m along, {across} across, {before} with fewer");
         before = along;
     }
+}
+
+/// Where one shelf or room looks like the next, and no end is in sight, nothing tells which one it is.
+#[test]
+fn shelves_and_rooms_without_end_are_ambiguous() {
+    let tally = |worlds: Vec<(World, [f64; 2])>| {
+        let (mut one, mut several) = (0, 0);
+        for (world, spread) in worlds {
+            let set = world.set("", 5, spread, 0.005, 2);
+            for (theirs, mine, _) in pairs(&set) {
+                let features = &mine.described.features;
+                let solver = SolverConfig { sigma_max: 1.5 * features.voxel(), seed: 7, ..SolverConfig::default() };
+                let config = RegisterConfig { solver, ..RegisterConfig::default() };
+                match register(&theirs.described.keypoints.first(SMALL), features, &config) {
+                    Ok(_) => one += 1,
+                    Err(RegisterError::Ambiguous { .. } | RegisterError::Lookalike { .. }) => several += 1,
+                    Err(_) => {}
+                }
+            }
+        }
+        (one, several)
+    };
+    for walls in [false, true] {
+        for cell in [3.0, 5.0] {
+            let (one, several) = tally((1..3).map(|seed| (World::aisles(cell, walls, seed), [cell, 0.3])).collect());
+            println!("cells of {cell} m, walls: {walls}: {several} ambiguous, {one} aligned");
+            // Every other one was aligned with the wrong cell before such rivals were looked for.
+            assert!(several >= 30 && one * 20 <= several);
+        }
+    }
+    let (one, several) = tally([1, 5].map(|seed| (World::hall(seed), [5.0, 3.0])).into());
+    println!("halls: {several} ambiguous, {one} aligned");
+    assert!(one >= 30 && several * 20 <= one);
 }
 
 /// Summaries only rank candidates; this prints how well. Two different streets must be told apart.

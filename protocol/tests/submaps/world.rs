@@ -17,6 +17,8 @@ pub struct World {
 
 const RANGE_MAX: f64 = 12.0;
 const VOXEL: f64 = 0.15;
+/// Half the width of an aisle.
+const AISLE: f64 = 0.8;
 
 impl World {
     /// A furnished hall of 14 × 9 × 3 m.
@@ -48,6 +50,34 @@ impl World {
             [Vector3::new(at, side, 0.0), Vector3::new(at + 0.9, side + 0.75, 2.0)]
         };
         Self { boxes: std::iter::once(walls).chain((0..cupboards).map(cupboard)).collect(), pillars: vec![] }
+    }
+
+    /// Shelves without end: one furnished cell of so many metres again and again, with aisles along x between; or, if they
+    /// have walls, rooms with doors where the aisles pass.
+    pub fn aisles(cell: f64, walls: bool, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let middle = cell / 2.0;
+        let mut model = Vec::new();
+        while model.len() < 8 {
+            let corner = Vector3::new(rng.random_range(0.0..cell), rng.random_range(0.0..cell), 0.0);
+            let size = Vector3::new(rng.random_range(0.3..1.8), rng.random_range(0.3..1.2), rng.random_range(0.4..2.2));
+            if corner.y > middle + AISLE || corner.y + size.y < middle - AISLE {
+                model.push([corner, corner + size]);
+            }
+        }
+        if walls {
+            let wall =
+                |from: [f64; 2], to: [f64; 2]| [Vector3::new(from[0], from[1], 0.0), Vector3::new(to[0], to[1], 3.0)];
+            model.push(wall([0.0, 0.0], [cell, 0.15]));
+            model.push(wall([0.0, 0.0], [0.15, middle - AISLE]));
+            model.push(wall([0.0, middle + AISLE], [0.15, cell]));
+        }
+        let mut boxes = vec![[Vector3::new(-100.0, -100.0, 0.0), Vector3::new(100.0, 100.0, 6.0)]];
+        for (x, y) in (-6..6).flat_map(|x| (-6..6).map(move |y| (f64::from(x), f64::from(y)))) {
+            let by = Vector3::new(x * cell, y * cell - middle, 0.0);
+            boxes.extend(model.iter().map(|corners| corners.map(|corner| corner + by)));
+        }
+        Self { boxes, pillars: vec![] }
     }
 
     fn is_free(&self, p: &Vector3<f64>) -> bool {

@@ -6,11 +6,13 @@ use super::path::Path;
 use super::shape::Shape;
 use super::streets;
 use crate::dice::Dice;
-use core::f64::consts::{PI, TAU};
+use core::f64::consts::{FRAC_PI_2, PI, TAU};
 use libm::{cos, sin};
 
 /// Length of one wall panel, m.
 const PANEL_M: f64 = 1.2;
+/// Height of a room's walls, m.
+const ROOM_HEIGHT_M: f64 = 3.0;
 
 /// All solids of a world.
 pub fn shapes(options: &WorldOptions, paths: &[Path], dice: &mut Dice) -> Vec<Shape> {
@@ -19,6 +21,9 @@ pub fn shapes(options: &WorldOptions, paths: &[Path], dice: &mut Dice) -> Vec<Sh
         return streets::shapes(paths, dice).into_iter().filter(is_clear).collect();
     }
     let area = Area::around(paths, options.margin_m);
+    if options.aisles {
+        return lattice(&aisle_cell(options, dice), options.cell_m, &area);
+    }
     let mut shapes = outer_wall(&area, dice);
     let furniture = if options.aliased { repeated(options, &area, dice) } else { unique(options, &area, dice) };
     shapes.extend(furniture.into_iter().filter(is_clear));
@@ -32,6 +37,10 @@ struct Area {
 }
 
 impl Area {
+    fn cell(edge: f64) -> Self {
+        Self { low: [0.0; 2], high: [edge; 2] }
+    }
+
     fn around(paths: &[Path], margin: f64) -> Self {
         let (mut low, mut high) = ([0.0f64; 2], [0.0f64; 2]);
         for b in paths.iter().map(Path::bounds) {
@@ -68,17 +77,39 @@ fn unique(options: &WorldOptions, area: &Area, dice: &mut Dice) -> Vec<Shape> {
 
 /// One furnished cell, copied to every place of the lattice.
 fn repeated(options: &WorldOptions, area: &Area, dice: &mut Dice) -> Vec<Shape> {
-    let cell = Area { low: [0.0; 2], high: [options.cell_m; 2] };
-    let model = unique(options, &cell, dice);
+    lattice(&unique(options, &Area::cell(options.cell_m), dice), options.cell_m, area)
+}
+
+/// A furnished cell with an aisle through its middle, and walls and doors if it is a room.
+fn aisle_cell(options: &WorldOptions, dice: &mut Dice) -> Vec<Shape> {
+    let edge = options.cell_m;
+    let mut shapes = unique(options, &Area::cell(edge), dice);
+    if options.rooms {
+        let panels = (edge / PANEL_M).ceil();
+        let length = edge / panels;
+        let middles = (0..panels as usize).map(|k| length * (k as f64 + 0.5));
+        shapes.extend(middles.flat_map(|along| {
+            let wall = |at, yaw| Shape::block(at, 0.0, [length, 0.15, ROOM_HEIGHT_M], yaw, 0.0);
+            [wall([along, 0.0], 0.0), wall([0.0, along], FRAC_PI_2)]
+        }));
+    }
+    // As wide as if the aisle went on: what reaches in from the next cell leaves it free as well.
+    let aisle = Path::along(&[[-edge, edge / 2.0], [2.0 * edge, edge / 2.0]]);
+    shapes.retain(|shape| is_clear(shape, std::slice::from_ref(&aisle), options.clearance_m));
+    shapes
+}
+
+/// Copies of a cell all over an area.
+fn lattice(model: &[Shape], cell_m: f64, area: &Area) -> Vec<Shape> {
     let cells = |axis: usize| {
-        let low = (area.low[axis] / options.cell_m).floor() as i64;
-        let high = (area.high[axis] / options.cell_m).ceil() as i64;
+        let low = (area.low[axis] / cell_m).floor() as i64;
+        let high = (area.high[axis] / cell_m).ceil() as i64;
         low..high
     };
     let mut shapes = Vec::new();
     for x in cells(0) {
         for y in cells(1) {
-            let shift = [x as f64 * options.cell_m, y as f64 * options.cell_m];
+            let shift = [x as f64 * cell_m, y as f64 * cell_m];
             shapes.extend(model.iter().map(|shape| moved(shape, shift)));
         }
     }

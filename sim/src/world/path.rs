@@ -10,6 +10,8 @@ use libm::{atan2, cos, sin, sqrt};
 const CORNERS: usize = 720;
 /// Turn between successive loop centres (the golden angle), rad.
 const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
+/// Robots begin within so many cells of an aisle.
+const STARTS_CELLS: f64 = 3.0;
 /// Corners of a recorded drive are this far apart, m.
 const DRIVE_STEP_M: f64 = 0.5;
 /// The heading is that of a chord as long as a robot, not of one polyline edge, so that it has no steps, m...
@@ -42,6 +44,16 @@ impl Path {
             [centre[0] + radius * cos(angle), centre[1] + radius * sin(angle)]
         });
         Self::closed(corners.collect())
+    }
+
+    /// The aisle of robot `index` through a lattice of cells: two robots share one, in opposite directions, from anywhere
+    /// within its first few cells.
+    pub fn of_aisle(index: usize, cell_m: f64, length_m: f64, dice: &mut Dice) -> Self {
+        let y = cell_m * ((index / 2) as f64 + 0.5);
+        let start = dice.range(0.0, STARTS_CELLS * cell_m);
+        let (from, to) = (start, start + length_m);
+        let ends = if index.is_multiple_of(2) { [from, to] } else { [to, from] };
+        Self::along(&ends.map(|x| [x, y]))
     }
 
     /// The drive along these points, at least two, no two in a row the same.
