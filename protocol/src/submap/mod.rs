@@ -36,6 +36,7 @@ mod rings;
 pub mod runs;
 mod sampling;
 mod scene;
+mod shifts;
 pub mod summary;
 mod surface;
 #[cfg(test)]

@@ -46,7 +46,7 @@ impl World {
         let walls = [Vector3::new(-100.0, -2.0, 0.0), Vector3::new(100.0, 2.0, 2.5)];
         let cupboard = |k: usize| {
             // Never two at the same distance, on both sides by turns.
-            let (at, side) = (-3.0 + 2.3 * k as f64, if k % 2 == 0 { 1.25 } else { -2.0 });
+            let (at, side) = (-3.0 + 2.3 * k as f64, if k.is_multiple_of(2) { 1.25 } else { -2.0 });
             [Vector3::new(at, side, 0.0), Vector3::new(at + 0.9, side + 0.75, 2.0)]
         };
         Self { boxes: std::iter::once(walls).chain((0..cupboards).map(cupboard)).collect(), pillars: vec![] }
