@@ -31,12 +31,22 @@ struct Closure {
 
 impl Closure {
     /// Whether it is off from the odometry by so much of the way between its ends that it closes no loop: it took one place
-    /// for another.
-    fn is_elsewhere(&self, t_i_j: &Se3, trajectory: &Trajectory) -> bool {
-        let anchors: Vec<Se3> = (self.i..=self.j).filter_map(|k| trajectory.pose(k)).collect();
-        let way: f64 = anchors.windows(2).map(|step| (step[1].translation - step[0].translation).norm()).sum();
+    /// for another. `ways` are the distances driven to each anchor.
+    fn is_elsewhere(&self, t_i_j: &Se3, ways: &[f64]) -> bool {
+        let way = ways.get(self.i).zip(ways.get(self.j)).map_or(f64::INFINITY, |(from, to)| to - from);
         (self.t_i_j.pose.translation - t_i_j.translation).norm() > ELSEWHERE_SHARE * way
     }
+}
+
+/// The distance driven to each anchor, straight from one to the next.
+fn driven(trajectory: &Trajectory) -> Vec<f64> {
+    let (mut way, mut last) = (0.0, None);
+    let places = (0..trajectory.len()).filter_map(|k| trajectory.pose(k)).map(|pose| pose.translation);
+    let ways = places.map(|at| {
+        way += last.replace(at).map_or(0.0, |before| (at - before).norm());
+        way
+    });
+    ways.collect()
 }
 
 /// What became of the loop closures of one frame.
@@ -66,14 +76,14 @@ pub(super) fn gate(intake: &mut Intake) -> BTreeMap<FrameId, Loops> {
     }
     for (frame, mut closures) in by_frame {
         let chain = &intake.chains[&frame];
-        let (mut refused, mut refuted) = (Vec::new(), 0);
+        let (mut refused, mut refuted, ways) = (Vec::new(), 0, driven(&chain.trajectory));
         closures.retain(|c| {
             let odometry = chain.trajectory.relative(c.i, c.j);
             let distance = odometry.as_ref().map_or(f64::INFINITY, |t| t.distance_squared(&c.t_i_j));
             let good = distance <= CHI2_999[5];
             if !good {
                 refused.push((c.edge, Unused::Odometry(distance)));
-                refuted += usize::from(odometry.is_some_and(|t| c.is_elsewhere(&t.pose, &chain.trajectory)));
+                refuted += usize::from(odometry.is_some_and(|t| c.is_elsewhere(&t.pose, &ways)));
             }
             good
         });
