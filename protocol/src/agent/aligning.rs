@@ -60,6 +60,10 @@ impl Agent {
 
     /// Somebody aligned one of our submaps: we owe an answer, once.
     fn note_verification(&mut self, id: EntryId, fact: &AlignmentFact) {
+        // What a third party says of two others is no try of theirs, or a liar could keep all pairs from being tried.
+        if self.knowledge.alignment(id).is_none() {
+            return;
+        }
         self.negotiation.mark_tried((fact.i, fact.j));
         self.negotiation.wishes.remove((fact.i, fact.j));
         let ours = fact.i.frame.robot == self.me.robot || fact.j.frame.robot == self.me.robot;
@@ -298,7 +302,6 @@ impl Agent {
         let Some(work) = self.negotiation.running.remove(&job) else { return };
         self.negotiation.stir();
         self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
-        let outcome = self.unless_repeated(&work, outcome);
         match work.purpose {
             Purpose::Propose(guess) => {
                 self.tell_try(&work, guess, outcome.is_ok());
@@ -319,30 +322,6 @@ impl Agent {
                 self.write_verdict(id, verdict);
             }
         }
-    }
-
-    /// What was found, unless so much was found several times with the other frame, or in our own, that it says nothing.
-    fn unless_repeated(
-        &mut self,
-        work: &Work,
-        outcome: Result<Box<Measured>, RefusalReason>,
-    ) -> Result<Box<Measured>, RefusalReason> {
-        let (ours, theirs) = (work.mine.frame, work.theirs.frame);
-        let outcomes = &mut self.negotiation.outcomes;
-        match &outcome {
-            Ok(_) => outcomes.note(theirs, true),
-            Err(RefusalReason::Ambiguous) => outcomes.note(theirs, false),
-            Err(_) => {}
-        }
-        // What contradicts our own odometry tells by itself.
-        if outcome.is_ok()
-            && !self.is_loop(work.mine, work.theirs)
-            && [ours, theirs].iter().any(|f| self.negotiation.outcomes.repeats(*f))
-        {
-            self.stats.worked("repeated");
-            return Err(RefusalReason::Ambiguous);
-        }
-        outcome
     }
 
     fn tell_try(&mut self, work: &Work, guess: Guess, found: bool) {

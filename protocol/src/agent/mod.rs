@@ -25,7 +25,6 @@ mod negotiation;
 mod promise;
 mod ranking;
 mod refusals;
-pub mod repeats;
 mod shortlist;
 mod sighting;
 mod solving;

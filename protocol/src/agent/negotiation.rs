@@ -10,7 +10,6 @@
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
 use super::promise::{Guess, Promise};
-use super::repeats::Outcomes;
 use super::shortlist::{Candidate, Shortlist};
 use crate::config::Sensor;
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
@@ -105,8 +104,6 @@ pub struct Negotiation {
     tries: BTreeMap<(SubmapId, FrameId), usize>,
     /// What candidates promise.
     pub promise: Promise,
-    /// What tries found.
-    pub outcomes: Outcomes,
     /// Foreign alignments to answer.
     pub verify: BTreeSet<EntryId>,
     /// Blobs on their way.
@@ -133,7 +130,6 @@ impl Negotiation {
             tried: BTreeSet::new(),
             tries: BTreeMap::new(),
             promise: Promise::new(sensor),
-            outcomes: Outcomes::default(),
             verify: BTreeSet::new(),
             fetches: BTreeMap::new(),
             out_of_reach: BTreeSet::new(),

@@ -18,8 +18,10 @@ const CLOSURES_COMPARED_MAX: usize = 256;
 /// Others that one of them is compared with at most: a false one contradicts most of these as it does most of all.
 const COMPARISONS_MAX: usize = 32;
 
-/// Drift is less than this share of the way, even of odometry that is worse than it says.
+/// Drift is less than this share of the way, even of odometry that is worse than it says...
 const ELSEWHERE_SHARE: f64 = 0.25;
+/// ...or than this, m: who turns on the spot drifts, too.
+const ELSEWHERE_MIN_M: f64 = 2.0;
 
 /// One closure with `i < j`.
 struct Closure {
@@ -31,15 +33,16 @@ struct Closure {
 
 impl Closure {
     /// Whether it is off from the odometry by so much of the way between its ends that it closes no loop: it took one place
-    /// for another. `ways` are the distances driven to each anchor.
-    fn is_elsewhere(&self, t_i_j: &Se3, ways: &[f64]) -> bool {
-        let way = ways.get(self.i).zip(ways.get(self.j)).map_or(f64::INFINITY, |(from, to)| to - from);
-        (self.t_i_j.pose.translation - t_i_j.translation).norm() > ELSEWHERE_SHARE * way
+    /// for another. `driven` are the distances to each anchor, m.
+    fn is_elsewhere(&self, t_i_j: &Se3, driven: &[f64]) -> bool {
+        let way = driven.get(self.i).zip(driven.get(self.j)).map_or(f64::INFINITY, |(from, to)| to - from);
+        let off = (self.t_i_j.pose.translation - t_i_j.translation).norm();
+        off > ELSEWHERE_MIN_M.max(ELSEWHERE_SHARE * way)
     }
 }
 
 /// The distance driven to each anchor, straight from one to the next.
-fn driven(trajectory: &Trajectory) -> Vec<f64> {
+fn driven_to(trajectory: &Trajectory) -> Vec<f64> {
     let (mut way, mut last) = (0.0, None);
     let places = (0..trajectory.len()).filter_map(|k| trajectory.pose(k)).map(|pose| pose.translation);
     let ways = places.map(|at| {
@@ -52,9 +55,9 @@ fn driven(trajectory: &Trajectory) -> Vec<f64> {
 /// What became of the loop closures of one frame.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Loops {
-    /// The odometry between their ends agrees.
+    /// The odometry between their ends agrees, and the others do.
     pub(super) held: usize,
-    /// It refutes them, by more than drift could be.
+    /// It refutes them, by more than drift could be (never where the unit is unknown).
     pub(super) refuted: usize,
 }
 
@@ -76,19 +79,21 @@ pub(super) fn gate(intake: &mut Intake) -> BTreeMap<FrameId, Loops> {
     }
     for (frame, mut closures) in by_frame {
         let chain = &intake.chains[&frame];
-        let (mut refused, mut refuted, ways) = (Vec::new(), 0, driven(&chain.trajectory));
+        let is_metric = !intake.unknown_scale.contains(&frame);
+        let (mut refused, mut refuted, driven) = (Vec::new(), 0, driven_to(&chain.trajectory));
         closures.retain(|c| {
             let odometry = chain.trajectory.relative(c.i, c.j);
             let distance = odometry.as_ref().map_or(f64::INFINITY, |t| t.distance_squared(&c.t_i_j));
             let good = distance <= CHI2_999[5];
             if !good {
                 refused.push((c.edge, Unused::Odometry(distance)));
-                refuted += usize::from(odometry.is_some_and(|t| c.is_elsewhere(&t.pose, &ways)));
+                refuted += usize::from(is_metric && odometry.is_some_and(|t| c.is_elsewhere(&t.pose, &driven)));
             }
             good
         });
-        loops.insert(frame, Loops { held: closures.len(), refuted });
-        refused.extend(outvoted(&chain.trajectory, &closures).into_iter().map(|edge| (edge, Unused::OtherLoops)));
+        let outvoted = outvoted(&chain.trajectory, &closures);
+        loops.insert(frame, Loops { held: closures.len() - outvoted.len(), refuted });
+        refused.extend(outvoted.into_iter().map(|edge| (edge, Unused::OtherLoops)));
         for (edge, reason) in refused {
             intake.edges[edge].refuse(reason);
         }

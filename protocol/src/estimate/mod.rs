@@ -31,7 +31,6 @@ pub use intake::Kind as EdgeKind;
 pub use joint::{
     AgreedAlignment, EdgeEstimate, FrameChain, JointEstimate, MapProblem, PairEstimate, Unused, solve_map,
 };
-pub use pairs::AMBIGUOUS_SHARE;
 
 #[cfg(test)]
 mod hostile_tests;

@@ -23,7 +23,7 @@ const WEIGHED_MAX: usize = 32;
 
 /// With so many pairs of submaps ambiguous for each alignment that is used, the frames are. Measured in simulated halls: where
 /// every shelf is the same, false merges had 1 to 2.3; elsewhere LiDARs have up to 0.2 and landmarks up to 0.7.
-pub const AMBIGUOUS_SHARE: f64 = 0.8;
+const AMBIGUOUS_SHARE: f64 = 0.8;
 
 /// Loop closures of one frame that its odometry refutes, from which on they tell of a place that repeats itself: one may be
 /// chance.

@@ -124,7 +124,7 @@ impl<'a> Court<'a> {
         Self { theirs, mine, matches, scene, middle, chance, often }
     }
 
-    /// About to judge `poses` by other matches; what was told of chance still holds.
+    /// About to judge `poses` by other matches; they join those that tell what chance does.
     pub fn with<'b>(&'b self, matches: &'b [Pairing], poses: &[Pose]) -> Court<'b> {
         let all: Vec<Pose> = self.chance.iter().map(|(pose, _)| *pose).chain(poses.iter().copied()).collect();
         Court::new(self.theirs, self.mine, matches, self.scene, &all)

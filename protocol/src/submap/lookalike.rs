@@ -37,13 +37,13 @@ const FACING_MIN: f64 = 0.08;
 /// ...or this, with so many matches.
 const WELL_SUPPORTED: (f64, usize) = (0.05, 16);
 
-/// The most supported rival of `best` that stands, of those that `allowed` lets through.
+/// The most supported rival of `best` that stands, of poses that are `upright` before and after (`true`) they are polished.
 pub(super) fn rival(
     (theirs, their_cloud): (&Keypoints, &Cloud),
     (mine, my_cloud, my_points): (&Features, &Cloud, &[Vector3<f64>]),
     court: &Court<'_>,
     best: &Judged,
-    allowed: impl Fn(&Pose) -> bool,
+    upright: impl Fn(&Pose, bool) -> bool,
 ) -> Option<Judged> {
     let placed: Vec<Vector3<f64>> = their_cloud.points.iter().map(|p| best.pose.apply(p)).collect();
     let is_there =
@@ -51,11 +51,12 @@ pub(super) fn rival(
     let elsewhere = pair_up_except(theirs, mine, my_points, is_there).all;
     let is_apart = |pose: &Pose| court.differ(pose, &best.pose, APART, TURNED);
     let mut poses = hypotheses(their_cloud, my_cloud, &elsewhere);
-    poses.extend(shifts::shifts(&placed, &best.pose, their_cloud, my_cloud));
-    poses.retain(|pose| is_apart(pose) && allowed(pose));
+    poses.extend(shifts::shifts(&placed, &best.pose, their_cloud, my_cloud, APART));
+    poses.retain(|pose| is_apart(pose) && upright(pose, false));
     let court = court.with(&elsewhere, &poses);
     let stands = |rival: &Judged| {
         is_apart(&rival.pose)
+            && upright(&rival.pose, true)
             && rival.contradiction() <= CONTRADICTION_MAX
             && rival.support.len() >= SUPPORT_MIN
             && rival.confirmed() as f64 >= CONFIRMED_MIN * best.confirmed() as f64

@@ -208,8 +208,8 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
         return Err(ambiguous);
     }
     let (theirs_seen, mine_seen) = ((theirs, &their_cloud), (mine, &my_cloud, my_points.as_slice()));
-    let tilted = |pose: &Pose| upright(pose, TILT_SIGMAS[0]);
-    if let Some(rival) = lookalike::rival(theirs_seen, mine_seen, &court, best, tilted) {
+    let may_be = |pose: &Pose, is_polished: bool| upright(pose, TILT_SIGMAS[usize::from(is_polished)]);
+    if let Some(rival) = lookalike::rival(theirs_seen, mine_seen, &court, best, may_be) {
         return Err(RegisterError::Lookalike { support: best.support.len(), rival: rival.support.len() });
     }
     let anchors = best

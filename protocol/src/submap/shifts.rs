@@ -23,8 +23,8 @@ const UPRIGHT_COS_MAX: f64 = 0.7;
 /// Votes that are as good as one.
 const VOTES_OF_ONE: f64 = 10.0;
 
-/// The pose, which puts their points where `placed` says, moved by the shifts with most votes.
-pub(super) fn shifts(placed: &[Vector3<f64>], pose: &Pose, theirs: &Cloud, mine: &Cloud) -> Vec<Pose> {
+/// The pose, which puts their points where `placed` says, moved by the shifts with most votes that are `least` or longer.
+pub(super) fn shifts(placed: &[Vector3<f64>], pose: &Pose, theirs: &Cloud, mine: &Cloud, least: f64) -> Vec<Pose> {
     let Some([along, across, up]) = axes(mine) else { return Vec::new() };
     let level: Vec<(f64, [f64; 2])> =
         mine.points.iter().map(|p| (p.dot(&up), [p.dot(&along), p.dot(&across)])).collect();
@@ -46,10 +46,9 @@ pub(super) fn shifts(placed: &[Vector3<f64>], pose: &Pose, theirs: &Cloud, mine:
         let vote = 1.0 / (VOTES_OF_ONE + cells.len() as f64);
         cells.iter().for_each(|&cell| votes[cell] += vote);
     }
-    let shift = |cell: usize| {
-        let middle = |k: usize| (k as f64 + 0.5) * CELL - REACH;
-        along * middle(cell % CELLS) + across * middle(cell / CELLS)
-    };
+    let middle = |k: usize| (k as f64 + 0.5) * CELL - REACH;
+    let shift = |cell: usize| along * middle(cell % CELLS) + across * middle(cell / CELLS);
+    votes.iter_mut().enumerate().filter(|(cell, _)| shift(*cell).norm() < least).for_each(|(_, votes)| *votes = 0.0);
     let moved = |cell| Pose { translation: pose.translation + shift(cell), ..*pose };
     peaks(&votes).into_iter().map(moved).collect()
 }
@@ -121,12 +120,13 @@ mod tests {
     fn what_stands_at_every_step_is_found_there() {
         let (one, row) = (crates(1, 0.0), crates(4, 26.0));
         let pose = Pose { rotation: Matrix3::identity(), translation: Vector3::zeros() };
-        let found = shifts(&one.points, &pose, &one, &row);
+        let found = shifts(&one.points, &pose, &one, &row, 12.0);
         for want in [26.0, 52.0, 78.0] {
             let near = |pose: &Pose| (pose.translation - Vector3::new(want, 0.0, 0.0)).norm() <= CELL;
             assert!(found.iter().take(8).any(near), "{want} is not among the first of {found:?}");
         }
         assert!(found.len() <= SHIFTS_MAX && found.iter().all(|pose| pose.translation.z.abs() < 1e-9));
+        assert!(found.iter().all(|pose| pose.translation.norm() >= 12.0), "the pose itself takes no turn");
     }
 
     #[test]
@@ -134,8 +134,8 @@ mod tests {
         let edge = REACH - 1e-9;
         assert!(cell([edge, -REACH]).is_some() && cell([REACH, 0.0]).is_none() && cell([0.0, f64::NAN]).is_none());
         let pose = Pose { rotation: Matrix3::identity(), translation: Vector3::zeros() };
-        assert!(shifts(&[], &pose, &Cloud::default(), &Cloud::default()).is_empty());
+        assert!(shifts(&[], &pose, &Cloud::default(), &Cloud::default(), 12.0).is_empty());
         let one = crates(1, 0.0);
-        assert!(shifts(&[], &pose, &Cloud::default(), &one).is_empty());
+        assert!(shifts(&[], &pose, &Cloud::default(), &one, 12.0).is_empty());
     }
 }
