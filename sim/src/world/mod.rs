@@ -1,7 +1,7 @@
 //! The world robots drive through: a ground plane, walls with gaps, pillars and boxes of many sizes and orientations,
 //! all drawn from a seed, and a ray-cast range sensor in it. By default no two places look alike; with `aliased`, the
-//! same furnished cell repeats on a lattice, so that one place looks like another, with `aisles` exactly; with `streets`, a town stands along
-//! the robots' paths.
+//! same furnished cell repeats on a lattice, so that one place looks like another, with `aisles` exactly; with `streets`, a
+//! town stands along the robots' paths.
 
 pub mod drive;
 mod generate;
