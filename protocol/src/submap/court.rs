@@ -124,14 +124,21 @@ impl<'a> Court<'a> {
         Self { theirs, mine, matches, scene, middle, chance, often }
     }
 
-    /// About to judge `poses` by other matches; they join those that tell what chance does.
-    pub fn with<'b>(&'b self, matches: &'b [Pairing], poses: &[Pose]) -> Court<'b> {
-        let all: Vec<Pose> = self.chance.iter().map(|(pose, _)| *pose).chain(poses.iter().copied()).collect();
-        Court::new(self.theirs, self.mine, matches, self.scene, &all)
-    }
-
     /// The most promising poses, polished and judged, best first.
     pub fn judge(&self, poses: &[Pose]) -> Vec<Judged> {
+        let mut judged = self.judge_with(self.matches, poses, |_| true);
+        judged.sort_by(|a, b| b.score.total_cmp(&a.score));
+        judged
+    }
+
+    /// Of the poses the most promising ones that `may_be`, polished and judged with other matches.
+    pub fn judge_with(&self, matches: &[Pairing], poses: &[Pose], may_be: impl Fn(&Pose) -> bool) -> Vec<Judged> {
+        let promising = self.promising(poses).into_iter().filter(may_be).take(JUDGED_MAX);
+        promising.map(|pose| self.look(&pose, matches)).collect()
+    }
+
+    /// The poses that look best at first glance, polished a little, best first.
+    fn promising(&self, poses: &[Pose]) -> Vec<Pose> {
         let mut glanced: Vec<(f64, usize)> =
             (0..poses.len()).map(|k| (self.glance(&poses[k], 0..GLANCED), k)).collect();
         most(&mut glanced, GLANCED_AGAIN);
@@ -147,12 +154,12 @@ impl<'a> Court<'a> {
         let mut distinct: Vec<(f64, Pose)> =
             distinct.into_iter().map(|pose| (self.glance(&pose, 0..ROUGH), pose)).collect();
         distinct.sort_by(|a, b| b.0.total_cmp(&a.0));
-        distinct.truncate(JUDGED_MAX);
-        let all = self.theirs.points.len();
-        let look = |(_, pose)| self.close_look(self.polish(pose, all, &RADII));
-        let mut judged: Vec<Judged> = distinct.into_iter().map(look).collect();
-        judged.sort_by(|a, b| b.score.total_cmp(&a.score));
-        judged
+        distinct.into_iter().map(|(_, pose)| pose).collect()
+    }
+
+    /// The pose polished on all keypoints and looked at closely.
+    fn look(&self, pose: &Pose, matches: &[Pairing]) -> Judged {
+        self.close_look(self.polish(*pose, self.theirs.points.len(), &RADII), matches)
     }
 
     /// The first [`POLISHED_MAX`] of those glanced at, but of poses near one of them only [`ALIKE_MAX`]: the rest of a good
@@ -213,8 +220,8 @@ impl<'a> Court<'a> {
         pose
     }
 
-    fn close_look(&self, pose: Pose) -> Judged {
-        let support = self.support(&pose);
+    fn close_look(&self, pose: Pose, matches: &[Pairing]) -> Judged {
+        let support = self.support(&pose, matches);
         let mut judged =
             Judged { pose, confirmed: Vec::new(), contradicted: 0, support, fit: 0.0, surface: 0.0, score: 0.0 };
         let mut hits = 0;
@@ -252,7 +259,7 @@ impl Court<'_> {
         let turns = TURNS.iter().flat_map(|by| {
             [Vector3::x(), Vector3::y(), Vector3::z()].map(|axis| turned(&best.pose, &middle, &(axis * *by)))
         });
-        slides.chain(turns).map(|pose| self.close_look(pose).surface).fold(0.0, f64::max)
+        slides.chain(turns).map(|pose| self.close_look(pose, self.matches).surface).fold(0.0, f64::max)
     }
 
     /// Of the points that confirm a pose, the share that faces the direction which fewest do: a third at best, nothing on a
@@ -269,13 +276,13 @@ impl Court<'_> {
     }
 
     /// Matches that agree with the pose: one a keypoint, and one a feature of mine.
-    fn support(&self, pose: &Pose) -> Vec<Pairing> {
+    fn support(&self, pose: &Pose, matches: &[Pairing]) -> Vec<Pairing> {
         let agrees = |p: &&Pairing| {
             let (t, m) = (p.their as usize, p.my as usize);
             (pose.apply(&self.theirs.points[t]) - self.mine.points[m]).norm() <= f64::from(NEAR)
                 && (pose.rotation * self.theirs.normals[t]).dot(&self.mine.normals[m]) >= SUPPORT_COS_MIN
         };
-        let mut support: Vec<Pairing> = self.matches.iter().filter(agrees).copied().collect();
+        let mut support: Vec<Pairing> = matches.iter().filter(agrees).copied().collect();
         support.dedup_by_key(|p| p.their);
         let mut named = BTreeSet::new();
         support.retain(|p| named.insert(p.my));

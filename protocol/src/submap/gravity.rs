@@ -11,6 +11,7 @@
 //! as they scatter, whichever is more.
 
 use super::block::{folded, unfolded};
+use super::scene::Pose;
 use crate::config::UP_SIGMA_RANGE_RAD;
 use crate::geometry::{PoseWithCovariance, Se3, So3};
 use nalgebra::{Matrix3, Vector3};
@@ -163,6 +164,12 @@ fn turn_variances(motions: &[PoseWithCovariance], anchor: usize, keyframes: usiz
     (0..keyframes).map(between).collect()
 }
 
+/// Standard deviation of a pose's tilt, rad, before it is polished, beyond what the verticals err: poses of few matches are
+/// often off by several degrees,...
+const TILT_SIGMA_ROUGH: f64 = 0.06;
+/// ...and polished ones hardly by one.
+const TILT_SIGMA: f64 = 0.02;
+
 /// Both verticals of a pair of submaps.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Verticals {
@@ -199,6 +206,26 @@ impl Verticals {
     /// Whether a rotation that errs by `sigma` (rad, about each axis) itself may be right.
     pub fn allow(&self, r_mine_theirs: &Matrix3<f64>, sigma: f64) -> bool {
         self.tilt(r_mine_theirs) <= self.tilt_max(sigma)
+    }
+}
+
+/// What is known of which way is up, as a judge of poses in voxels.
+pub(super) struct Upright(pub(super) Option<Verticals>);
+
+impl Upright {
+    /// Whether a pose may be right, before it is polished...
+    pub(super) fn allows_rough(&self, pose: &Pose) -> bool {
+        self.0.is_none_or(|known| known.allow(&pose.rotation, TILT_SIGMA_ROUGH))
+    }
+
+    /// ...and after.
+    pub(super) fn allows(&self, pose: &Pose) -> bool {
+        self.0.is_none_or(|known| known.allow(&pose.rotation, TILT_SIGMA))
+    }
+
+    /// Which way is up in my frame, of length 1.
+    pub(super) fn up(&self) -> Option<&Vector3<f64>> {
+        self.0.as_ref().map(|known| known.mine.direction())
     }
 }
 

@@ -13,8 +13,8 @@ const LENGTH_TOLERANCE: f64 = 1.5;
 const LENGTH_MIN: f64 = 4.0;
 /// Cosines of a pair agree within this.
 const COSINE_TOLERANCE: f64 = 0.3;
-/// Pairs that are tried as poses at most.
-const POSES_MAX: usize = 1000;
+/// Pairs that are tried as poses at most, where nothing is known yet.
+pub const POSES_MAX: usize = 1000;
 /// Pairs ranked at most; matches of the last keypoints are left out beyond it.
 const PAIRS_MAX: usize = 400_000;
 /// Two poses that place everything within this distance and angle (rad) are one.
@@ -26,21 +26,24 @@ const POLISH: f64 = 3.0;
 /// Rounds of polishing.
 const POLISH_ROUNDS: usize = 2;
 
-/// Distinct poses, the one with the most agreement first.
-pub fn hypotheses(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Vec<Pose> {
+/// Distinct poses, the one with the most agreement first, of `tries` pairs at most.
+pub fn hypotheses(theirs: &Cloud, mine: &Cloud, matches: &[Pairing], tries: usize) -> Vec<Pose> {
     let agreement = Agreement::of(theirs, mine, matches);
     let mut poses: Vec<Pose> = Vec::new();
-    let mut explained = vec![[0_u64; POSES_MAX.div_ceil(64)]; matches.len()];
+    // A bit for each pose, match by match.
+    let words = tries.div_ceil(64);
+    let mut explained = vec![0_u64; words * matches.len()];
     let mut members: Vec<Pairing> = Vec::new();
     let middle = theirs.points.iter().sum::<Vector3<f64>>() / theirs.points.len().max(1) as f64;
     let mut tried = 0;
     for (x, y) in agreement.ranked() {
         let (x, y) = (x as usize, y as usize);
         // What an earlier pose explains leads to it again, and must not use up the tries of others.
-        if explained[x].iter().zip(&explained[y]).any(|(a, b)| a & b != 0) {
+        let by = |k: usize| explained[words * k..words * (k + 1)].iter();
+        if by(x).zip(by(y)).any(|(a, b)| a & b != 0) {
             continue;
         }
-        if tried == POSES_MAX {
+        if tried == tries {
             break;
         }
         tried += 1;
@@ -50,7 +53,7 @@ pub fn hypotheses(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Vec<Pose
         if poses.iter().all(|other| pose.differs(other, &middle, SAME.0, SAME.1)) {
             for k in [x, y].into_iter().chain(agreement.common(x, y)) {
                 if explains(&pose, theirs, mine, &matches[k]) {
-                    explained[k][poses.len() / 64] |= 1 << (poses.len() % 64);
+                    explained[words * k + poses.len() / 64] |= 1 << (poses.len() % 64);
                 }
             }
             poses.push(pose);
@@ -227,11 +230,11 @@ mod tests {
                 mine.normals.push(rotation * normal);
             }
         }
-        let found = hypotheses(&theirs, &mine, &matches);
+        let found = hypotheses(&theirs, &mine, &matches, POSES_MAX);
         for bay in &bays {
             assert!(found.iter().any(|pose| !pose.differs(bay, &Vector3::zeros(), 0.1, 0.01)), "{bay:?}");
         }
         assert!(found.len() <= POSES_MAX);
-        assert!(hypotheses(&theirs, &mine, &[]).is_empty());
+        assert!(hypotheses(&theirs, &mine, &[], POSES_MAX).is_empty());
     }
 }

@@ -13,13 +13,16 @@
 //! True pairs: halls 0 of 59, 7-Scenes 0 of 84, KITTI 07 0 of 19.
 
 use super::court::{Court, Judged};
-use super::features::{Features, Keypoints};
+use super::features::Features;
+use super::gravity::Upright;
 use super::hypotheses::hypotheses;
-use super::matching::pair_up_except;
+use super::matching::Pairings;
 use super::scene::{Cloud, Pose};
 use super::shifts;
 use nalgebra::Vector3;
 
+/// Pairs of matches with what lies elsewhere that are tried as poses at most.
+const TRIES_MAX: usize = 300;
 /// What lies this near to where the best pose puts a keypoint is not elsewhere, voxels.
 const ELSEWHERE: f64 = 6.0;
 /// A rival puts their middle this far from where the best pose does, voxels...
@@ -37,32 +40,33 @@ const FACING_MIN: f64 = 0.08;
 /// ...or this, with so many matches.
 const WELL_SUPPORTED: (f64, usize) = (0.05, 16);
 
-/// The most supported rival of `best` that stands, of poses that are `upright` before and after (`true`) they are polished.
+/// The most supported rival of `best` that stands.
 pub(super) fn rival(
-    (theirs, their_cloud): (&Keypoints, &Cloud),
-    (mine, my_cloud, my_points): (&Features, &Cloud, &[Vector3<f64>]),
+    pairings: &Pairings,
+    (mine, my_points): (&Features, &[Vector3<f64>]),
+    (their_cloud, my_cloud): (&Cloud, &Cloud),
     court: &Court<'_>,
     best: &Judged,
-    upright: impl Fn(&Pose, bool) -> bool,
+    upright: &Upright,
 ) -> Option<Judged> {
     let placed: Vec<Vector3<f64>> = their_cloud.points.iter().map(|p| best.pose.apply(p)).collect();
     let is_there =
         |their: usize, my: usize| (placed[their] - my_cloud.points[my]).norm_squared() <= ELSEWHERE * ELSEWHERE;
-    let elsewhere = pair_up_except(theirs, mine, my_points, is_there).all;
+    let elsewhere = pairings.except(mine, my_points, is_there);
     let is_apart = |pose: &Pose| court.differ(pose, &best.pose, APART, TURNED);
-    let mut poses = hypotheses(their_cloud, my_cloud, &elsewhere);
-    poses.extend(shifts::shifts(&placed, &best.pose, their_cloud, my_cloud, APART));
-    poses.retain(|pose| is_apart(pose) && upright(pose, false));
-    let court = court.with(&elsewhere, &poses);
+    let mut poses = hypotheses(their_cloud, my_cloud, &elsewhere, TRIES_MAX);
+    poses.extend(shifts::shifts((&placed, &best.pose), their_cloud, my_cloud, upright.up(), APART));
+    poses.retain(|pose| is_apart(pose) && upright.allows_rough(pose));
     let stands = |rival: &Judged| {
         is_apart(&rival.pose)
-            && upright(&rival.pose, true)
+            && upright.allows(&rival.pose)
             && rival.contradiction() <= CONTRADICTION_MAX
             && rival.support.len() >= SUPPORT_MIN
             && rival.confirmed() as f64 >= CONFIRMED_MIN * best.confirmed() as f64
             && faces_all_ways(court.least_facing(rival), rival.support.len())
     };
-    court.judge(&poses).into_iter().filter(stands).max_by_key(|rival| rival.support.len())
+    let judged = court.judge_with(&elsewhere, &poses, is_apart);
+    judged.into_iter().filter(stands).max_by_key(|rival| rival.support.len())
 }
 
 fn faces_all_ways(least_facing: f64, support: usize) -> bool {

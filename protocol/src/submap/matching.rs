@@ -17,6 +17,9 @@ use pulp::Arch;
 pub const COUNTERPARTS: usize = 4;
 /// Features nearest in descriptor space among which they are sought.
 const SHORTLIST: usize = 40;
+/// Nearest features that are kept of each keypoint, to choose from again without those that lie in one place: on a surface
+/// of one feature a voxel, a place of six voxels' radius holds 113.
+const NEAREST: usize = 160;
 /// Counterparts of one keypoint are at least this far from each other, voxels.
 const APART_VOXELS: f64 = 3.0;
 
@@ -48,6 +51,8 @@ pub struct Pairings {
     pub all: Vec<Pairing>,
     /// Those in which each is the other's nearest, best first.
     pub mutual: Vec<Pairing>,
+    /// Up to [`NEAREST`] of each keypoint, keypoint by keypoint, best first.
+    nearest: Vec<Pairing>,
 }
 
 /// Matches their keypoints against all of mine, mutual nearest neighbours only.
@@ -57,6 +62,19 @@ pub fn match_keypoints(theirs: &Keypoints, mine: &Features) -> Matches {
 }
 
 impl Pairings {
+    /// The counterparts that each keypoint has if those are left out that `is_out` says, by positions of keypoint and
+    /// feature.
+    pub fn except(
+        &self,
+        mine: &Features,
+        my_points: &[Vector3<f64>],
+        is_out: impl Fn(usize, usize) -> bool,
+    ) -> Vec<Pairing> {
+        let stays = |p: &&Pairing| !is_out(p.their as usize, p.my as usize);
+        let nearest: Vec<Pairing> = self.nearest.iter().filter(stays).copied().collect();
+        counterparts(&nearest, my_points, APART_VOXELS * mine.voxel())
+    }
+
     /// The mutual ones as points.
     pub fn matches(&self, theirs: &Keypoints, my_points: &[Vector3<f64>]) -> Matches {
         let their_points = theirs.surfels();
@@ -70,57 +88,55 @@ impl Pairings {
 
 /// Finds the counterparts of each of their keypoints among my features, which lie at `my_points`.
 pub fn pair_up(theirs: &Keypoints, mine: &Features, my_points: &[Vector3<f64>]) -> Pairings {
-    pair_up_except(theirs, mine, my_points, |_, _| false)
-}
-
-/// The same, without pairs of a keypoint and a feature, by their positions, that are to be left out.
-pub fn pair_up_except(
-    theirs: &Keypoints,
-    mine: &Features,
-    my_points: &[Vector3<f64>],
-    is_out: impl Fn(usize, usize) -> bool,
-) -> Pairings {
     let arch = Arch::new();
-    let apart = (APART_VOXELS * mine.voxel()) * (APART_VOXELS * mine.voxel());
     let my_codes = mine.codes();
     let mut distances = vec![0; my_codes.len()];
     // For each feature the keypoint nearest to it so far.
     let mut likes = vec![(i32::MAX, u32::MAX); my_codes.len()];
-    let mut all = Vec::with_capacity(COUNTERPARTS * theirs.len());
-    let mut shortlist: Vec<(i32, u32)> = Vec::with_capacity(my_codes.len());
+    let mut nearest = Vec::with_capacity(NEAREST.min(my_codes.len()) * theirs.len());
+    let mut ranked: Vec<(i32, u32)> = Vec::with_capacity(my_codes.len());
     for (their, code) in (0u32..).zip(theirs.codes()) {
         wide(arch, || compare(&code, my_codes, &mut distances));
-        let left_out = distances.iter_mut().enumerate().filter(|(my, _)| is_out(their as usize, *my));
-        left_out.for_each(|(_, distance)| *distance = i32::MAX);
         likes.iter_mut().zip(&distances).for_each(|(like, &distance)| {
             if distance < like.0 {
                 *like = (distance, their);
             }
         });
-        shortlist.clear();
-        shortlist.extend(distances.iter().copied().zip(0u32..).filter(|(distance, _)| *distance < i32::MAX));
-        if shortlist.len() > SHORTLIST {
-            shortlist.select_nth_unstable(SHORTLIST - 1);
-            shortlist.truncate(SHORTLIST);
+        ranked.clear();
+        ranked.extend(distances.iter().copied().zip(0u32..));
+        if ranked.len() > NEAREST {
+            ranked.select_nth_unstable(NEAREST - 1);
+            ranked.truncate(NEAREST);
         }
-        shortlist.sort_unstable();
-        let begin = all.len();
-        for &(distance, my) in &shortlist {
-            let near =
-                |other: &Pairing| (my_points[other.my as usize] - my_points[my as usize]).norm_squared() <= apart;
-            if !all[begin..].iter().any(near) {
-                all.push(Pairing { distance, their, my });
-                if all.len() == begin + COUNTERPARTS {
-                    break;
-                }
-            }
-        }
+        ranked.sort_unstable();
+        nearest.extend(ranked.iter().map(|&(distance, my)| Pairing { distance, their, my }));
     }
+    let all = counterparts(&nearest, my_points, APART_VOXELS * mine.voxel());
     let first = |k: usize| k == 0 || all[k].their != all[k - 1].their;
     let liked = |p: &Pairing| likes[p.my as usize].1 == p.their;
     let mut mutual: Vec<Pairing> = (0..all.len()).filter(|&k| first(k)).map(|k| all[k]).filter(liked).collect();
     mutual.sort_unstable();
-    Pairings { all, mutual }
+    Pairings { all, mutual, nearest }
+}
+
+/// Of each keypoint's nearest features the best ones that lie `apart` from each other.
+fn counterparts(nearest: &[Pairing], my_points: &[Vector3<f64>], apart: f64) -> Vec<Pairing> {
+    let mut all: Vec<Pairing> = Vec::new();
+    for of_one in nearest.chunk_by(|a, b| a.their == b.their) {
+        let begin = all.len();
+        for pairing in of_one.iter().take(SHORTLIST) {
+            let near = |other: &Pairing| {
+                (my_points[other.my as usize] - my_points[pairing.my as usize]).norm_squared() <= apart * apart
+            };
+            if !all[begin..].iter().any(near) {
+                all.push(*pairing);
+            }
+            if all.len() == begin + COUNTERPARTS {
+                break;
+            }
+        }
+    }
+    all
 }
 
 /// Squared distances of the code from all others.

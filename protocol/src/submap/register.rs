@@ -15,8 +15,8 @@
 
 use super::court::{Court, Judged};
 use super::features::{Features, Keypoints, in_voxels};
-use super::gravity::Verticals;
-use super::hypotheses::hypotheses;
+use super::gravity::{Upright, Verticals};
+use super::hypotheses::{POSES_MAX, hypotheses};
 use super::lookalike;
 use super::matching::pair_up;
 use super::refine::{RefineConfig, RefineError, Refined, refine_anchored};
@@ -33,9 +33,6 @@ const LOG10: f64 = core::f64::consts::LOG10_E;
 
 /// Largest standard deviation of a rotation, rad: a covariance speaks of the neighbourhood in which rotations add up.
 const ROTATION_SIGMA_MAX: f64 = 0.25;
-/// Standard deviation of a pose's tilt, rad, before and after it is polished, beyond what the verticals err. Poses of few
-/// matches are often off by several degrees; a polished one hardly by one.
-const TILT_SIGMAS: [f64; 2] = [0.06, 0.02];
 /// Share of keypoints that may lie in one half-voxel cell with another: of a thinned cloud's hardly any do.
 const CROWDED_MAX: f64 = 0.1;
 
@@ -178,19 +175,19 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     };
     let consensus = align(&problem, &config.solver)?.ok();
 
-    let mut poses = hypotheses(&their_cloud, &my_cloud, &pairings.all);
+    let mut poses = hypotheses(&their_cloud, &my_cloud, &pairings.all, POSES_MAX);
     if let Some(found) = &consensus {
         let pose = found.t_target_source.sim().to_se3();
         poses.insert(0, Pose { rotation: pose.rotation.matrix(), translation: pose.translation / voxel });
     }
     // The others still tell what chance does.
-    let upright = |pose: &Pose, sigma| config.verticals.is_none_or(|known| known.allow(&pose.rotation, sigma));
+    let upright = Upright(config.verticals);
     let scene = Scene::new(mine);
     let court = Court::new(&their_cloud, &my_cloud, &pairings.all, &scene, &poses);
-    poses.retain(|pose| upright(pose, TILT_SIGMAS[0]));
+    poses.retain(|pose| upright.allows_rough(pose));
     let count = poses.len();
     let mut judged = court.judge(&poses);
-    judged.retain(|j| upright(&j.pose, TILT_SIGMAS[1]));
+    judged.retain(|j| upright.allows(&j.pose));
     let passes = |j: &&Judged| {
         j.score >= config.score_min && j.fit >= config.fit_min && j.contradiction() <= config.contradiction_max
     };
@@ -207,9 +204,8 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     if rival >= config.rival_ratio * best.score {
         return Err(ambiguous);
     }
-    let (theirs_seen, mine_seen) = ((theirs, &their_cloud), (mine, &my_cloud, my_points.as_slice()));
-    let may_be = |pose: &Pose, is_polished: bool| upright(pose, TILT_SIGMAS[usize::from(is_polished)]);
-    if let Some(rival) = lookalike::rival(theirs_seen, mine_seen, &court, best, may_be) {
+    let clouds = (&their_cloud, &my_cloud);
+    if let Some(rival) = lookalike::rival(&pairings, (mine, &my_points), clouds, &court, best, &upright) {
         return Err(RegisterError::Lookalike { support: best.support.len(), rival: rival.support.len() });
     }
     let anchors = best

@@ -1,7 +1,8 @@
 //! Where else a submap would fit, upright as it stands: what repeats itself in steps. Descriptors seldom tell, since from
 //! where a robot stood the next shelf is seen from another side; surfaces do. Every keypoint votes for the shifts that bring
 //! it, along the ground, onto a surface that faces the same way; who votes for many says little of each. What faces up or
-//! down, and so fits anywhere, has no vote. The ground is what most surfaces lie in. Lengths are in voxels.
+//! down, and so fits anywhere, has no vote. Where it is not known which way is up, the ground is what most surfaces lie in.
+//! Lengths are in voxels.
 
 use super::scene::{Cloud, Pose};
 use nalgebra::{Matrix3, Vector3};
@@ -24,8 +25,16 @@ const UPRIGHT_COS_MAX: f64 = 0.7;
 const VOTES_OF_ONE: f64 = 10.0;
 
 /// The pose, which puts their points where `placed` says, moved by the shifts with most votes that are `least` or longer.
-pub(super) fn shifts(placed: &[Vector3<f64>], pose: &Pose, theirs: &Cloud, mine: &Cloud, least: f64) -> Vec<Pose> {
-    let Some([along, across, up]) = axes(mine) else { return Vec::new() };
+/// `up` is of length 1, in my frame.
+pub(super) fn shifts(
+    (placed, pose): (&[Vector3<f64>], &Pose),
+    theirs: &Cloud,
+    mine: &Cloud,
+    up: Option<&Vector3<f64>>,
+    least: f64,
+) -> Vec<Pose> {
+    let up = up.copied().unwrap_or_else(|| most_faced(mine));
+    let Some([along, across]) = ground(&up) else { return Vec::new() };
     let level: Vec<(f64, [f64; 2])> =
         mine.points.iter().map(|p| (p.dot(&up), [p.dot(&along), p.dot(&across)])).collect();
     let mut votes = vec![0.0; CELLS * CELLS];
@@ -53,14 +62,18 @@ pub(super) fn shifts(placed: &[Vector3<f64>], pose: &Pose, theirs: &Cloud, mine:
     peaks(&votes).into_iter().map(moved).collect()
 }
 
-/// Two axes in the plane that most of a cloud's surfaces lie in, and its normal.
-fn axes(cloud: &Cloud) -> Option<[Vector3<f64>; 3]> {
+/// The direction that most of a cloud's surfaces face.
+fn most_faced(cloud: &Cloud) -> Vector3<f64> {
     let spread: Matrix3<f64> = cloud.normals.iter().map(|n| n * n.transpose()).sum();
     let eigen = spread.symmetric_eigen();
-    let up: Vector3<f64> = eigen.eigenvectors.column(eigen.eigenvalues.imax()).into_owned();
+    eigen.eigenvectors.column(eigen.eigenvalues.imax()).into_owned()
+}
+
+/// Two axes of the plane whose normal is `up`.
+fn ground(up: &Vector3<f64>) -> Option<[Vector3<f64>; 2]> {
     let aside = Vector3::ith(up.iamin(), 1.0);
     let along = up.cross(&aside).try_normalize(1e-9)?;
-    Some([along, up.cross(&along), up])
+    Some([along, up.cross(&along)])
 }
 
 /// The cell of a shift; none of one that is too long.
@@ -120,7 +133,7 @@ mod tests {
     fn what_stands_at_every_step_is_found_there() {
         let (one, row) = (crates(1, 0.0), crates(4, 26.0));
         let pose = Pose { rotation: Matrix3::identity(), translation: Vector3::zeros() };
-        let found = shifts(&one.points, &pose, &one, &row, 12.0);
+        let found = shifts((&one.points, &pose), &one, &row, None, 12.0);
         for want in [26.0, 52.0, 78.0] {
             let near = |pose: &Pose| (pose.translation - Vector3::new(want, 0.0, 0.0)).norm() <= CELL;
             assert!(found.iter().take(8).any(near), "{want} is not among the first of {found:?}");
@@ -129,13 +142,33 @@ mod tests {
         assert!(found.iter().all(|pose| pose.translation.norm() >= 12.0), "the pose itself takes no turn");
     }
 
+    /// Long shelves along x, one every 26 voxels along y: most surfaces face y.
+    #[test]
+    fn who_knows_which_way_is_up_takes_no_shelf_for_the_ground() {
+        let shelves = |count: i32| {
+            let mut cloud = Cloud::default();
+            for (k, x, z) in (0..count).flat_map(|k| (0..30).flat_map(move |x| (0..20).map(move |z| (k, x, z)))) {
+                cloud.points.push([2.0 * f64::from(x), 26.0 * f64::from(k), 2.0 * f64::from(z)].into());
+                cloud.normals.push(Vector3::y());
+            }
+            cloud
+        };
+        let (one, rows) = (shelves(1), shelves(3));
+        let pose = Pose { rotation: Matrix3::identity(), translation: Vector3::zeros() };
+        let next_is_found = |up: Option<&Vector3<f64>>| {
+            let found = shifts((&one.points, &pose), &one, &rows, up, 12.0);
+            found.iter().any(|pose| (pose.translation - Vector3::new(0.0, 26.0, 0.0)).norm() <= CELL)
+        };
+        assert!(next_is_found(Some(&Vector3::z())) && !next_is_found(None));
+    }
+
     #[test]
     fn shifts_are_bounded_and_nothing_has_none() {
         let edge = REACH - 1e-9;
         assert!(cell([edge, -REACH]).is_some() && cell([REACH, 0.0]).is_none() && cell([0.0, f64::NAN]).is_none());
         let pose = Pose { rotation: Matrix3::identity(), translation: Vector3::zeros() };
-        assert!(shifts(&[], &pose, &Cloud::default(), &Cloud::default(), 12.0).is_empty());
+        assert!(shifts((&[], &pose), &Cloud::default(), &Cloud::default(), None, 12.0).is_empty());
         let one = crates(1, 0.0);
-        assert!(shifts(&[], &pose, &Cloud::default(), &one, 12.0).is_empty());
+        assert!(shifts((&[], &pose), &Cloud::default(), &one, None, 12.0).is_empty());
     }
 }
