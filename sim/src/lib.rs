@@ -16,6 +16,7 @@ pub mod network;
 pub mod queue;
 pub mod record;
 pub mod report;
+pub mod run;
 pub mod scenario;
 pub mod stage;
 pub mod svg;

@@ -1,14 +1,13 @@
 //! `merganser-sim vopr`: one seed, told in full, or a band of them, told in sum.
 
 use super::{SeedReport, Tally, draw, run_seed, settle_secs};
-use crate::band::{Band, parse_band};
+use crate::band::{Band, jobs, parse_band};
 use crate::bar::progress_bar;
 use crate::check::Violation;
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// Of a band, each seed of which this is a divisor runs twice, and must leave one trace.
@@ -89,33 +88,27 @@ pub fn run(args: &VoprArgs) -> anyhow::Result<bool> {
 }
 
 fn run_band(band: Band, args: &VoprArgs) -> anyhow::Result<BTreeMap<u64, SeedReport>> {
-    let jobs = args.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
     let bar = progress_bar(band.1 - band.0, "seeds")?;
-    let (next, broken) = (AtomicU64::new(band.0), AtomicBool::new(false));
-    let reports = Mutex::new(BTreeMap::new());
-    std::thread::scope(|scope| {
-        for _ in 0..jobs {
-            scope.spawn(|| {
-                loop {
-                    let seed = next.fetch_add(1, Ordering::Relaxed);
-                    if seed >= band.1 || (args.fail_fast && broken.load(Ordering::Relaxed)) {
-                        return;
-                    }
-                    let twice = args.twice || seed.is_multiple_of(TWICE_EVERY);
-                    let report = run_seed(seed, args.robots.map(usize::from), twice);
-                    if let Some(text) = broken_text(&report, args) {
-                        broken.store(true, Ordering::Relaxed);
-                        // Told at once: a long band may be ended before its time.
-                        bar.suspend(|| say(&text)).unwrap_or_default();
-                    }
-                    reports.lock().unwrap_or_else(PoisonError::into_inner).insert(seed, report);
-                    bar.inc(1);
-                }
-            });
+    let broken = AtomicBool::new(false);
+    let mut reports = BTreeMap::new();
+    let work = |seed: u64| {
+        if args.fail_fast && broken.load(Ordering::Relaxed) {
+            return None;
         }
+        let report = run_seed(seed, args.robots.map(usize::from), args.twice || seed.is_multiple_of(TWICE_EVERY));
+        if let Some(text) = broken_text(&report, args) {
+            broken.store(true, Ordering::Relaxed);
+            // Told at once: a long band may be ended before its time.
+            bar.suspend(|| say(&text)).unwrap_or_default();
+        }
+        bar.inc(1);
+        Some(report)
+    };
+    band.for_each(jobs(args.jobs), work, |seed, report| {
+        reports.insert(seed, report);
     });
     bar.finish_and_clear();
-    Ok(reports.into_inner().unwrap_or_else(PoisonError::into_inner))
+    Ok(reports)
 }
 
 /// What broke, if anything, and how to see it again.

@@ -1,6 +1,5 @@
 //! Three planar robots on a real laser log (Radish `aces`), through the importer and the cores on perfect wires: they
 //! merge, nothing false is used, and the merged map explains the relations that people checked by hand.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
 
 use merganser::demo::views::{pose, relation};
 use merganser::recording::Recording;

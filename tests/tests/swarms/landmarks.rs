@@ -1,6 +1,5 @@
 //! Five planar robots among bar codes (MRCLAM), through the importer and the cores on perfect wires: the five end in one
 //! frame, no false alignment is used, and the landmarks of the joint map lie where the survey says.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
 
 use merganser::demo::trajectory::fit;
 use merganser::demo::views::{pose, relation};

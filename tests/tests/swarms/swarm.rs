@@ -1,13 +1,12 @@
 //! A simulated swarm over bad radios converges, and the same seed gives the same run, in this process or another.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
 
 use merganser_sim::report::Report;
 use merganser_tests::simulate;
 use std::process::Command;
 
-const LOSSY: &str = include_str!("../../sim/scenarios/lossy.toml");
-const PARTITION: &str = include_str!("../../sim/scenarios/partition.toml");
-const CALIBRATION: &str = include_str!("scenarios/calibration.toml");
+const LOSSY: &str = include_str!("../../../sim/scenarios/lossy.toml");
+const PARTITION: &str = include_str!("../../../sim/scenarios/partition.toml");
+const CALIBRATION: &str = include_str!("../scenarios/calibration.toml");
 /// Set for the child process that only prints a trace.
 const CHILD: &str = "MERGANSER_TEST_TRACE";
 
@@ -55,7 +54,7 @@ fn the_same_seed_gives_the_same_run_and_another_seed_another() {
     assert_eq!(simulate(CALIBRATION, 5).unwrap().trace, once);
     assert_ne!(simulate(CALIBRATION, 6).unwrap().trace, once);
     let child = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "prints_a_trace_for_another_process", "--nocapture"])
+        .args(["--exact", "swarm::prints_a_trace_for_another_process", "--nocapture"])
         .env(CHILD, "5")
         .output()
         .unwrap();

@@ -1,7 +1,6 @@
 //! Robots with one camera each, whose SLAMs measure in units that nobody knows (SIM(3)), end in one map: with their scales
 //! right, their uncertainty honest, and their own loops in it; beside one that knows the metre, over a bad radio, with a
 //! crash and a SLAM that begins anew. Where everything looks alike, nothing merges.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
 
 use merganser_protocol::agent::Agent;
 use merganser_sim::report::Report;
@@ -9,8 +8,8 @@ use merganser_sim::scenario::Scenario;
 use merganser_sim::swarm::{Outcome, Swarm};
 use merganser_tests::simulate;
 
-const SCALES: &str = include_str!("../../sim/scenarios/scales.toml");
-const SHELVES: &str = include_str!("../../sim/scenarios/shelves.toml");
+const SCALES: &str = include_str!("../../../sim/scenarios/scales.toml");
+const SHELVES: &str = include_str!("../../../sim/scenarios/shelves.toml");
 
 /// Scales are right to within this share.
 const SCALE_OFF_MAX: f64 = 0.02;

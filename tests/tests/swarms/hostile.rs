@@ -1,6 +1,5 @@
 //! A swarm that works stays a swarm that works: bad keyframes, mangled messages and a member who signs lies are refused,
 //! counted and reported, and the honest robots' map is what it would have been.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
 
 use ed25519_dalek::SigningKey;
 use merganser::recording::Recording;

@@ -3,13 +3,12 @@
 //!
 //! That band is one-sided. What alignments of one submap have in common is charged in the consensus of two frames, and their
 //! own covariances are cautious (see the core's `distortion`): estimates may be more certain than they say, never less.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "the whole file is a test")]
 
 use merganser_sim::bench::calibration::{Mean, World, measure};
 use merganser_sim::report::Report;
 use merganser_tests::simulate;
 
-const SCENARIO: &str = include_str!("scenarios/calibration.toml");
+const SCENARIO: &str = include_str!("../scenarios/calibration.toml");
 const SEEDS: u64 = 120;
 /// 95 % quantile of χ²₆.
 const CHI2_6_95: f64 = 12.591_587;
