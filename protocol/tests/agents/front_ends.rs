@@ -1,9 +1,6 @@
 //! Front ends that restart, relocalise or err: a new epoch or a refusal, and no lie in the odometry.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a test fails by panicking")]
 
-mod common;
-
-use common::{Wires, agent};
+use super::common::{Wires, agent};
 use merganser_protocol::agent::Restored;
 use merganser_protocol::agent::io::{Command, EpochReason, Event, Input, Record};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
@@ -140,9 +137,9 @@ fn two_sessions_that_take_turns_begin_one_epoch() {
 
 #[test]
 fn beyond_its_last_epoch_a_robot_that_restarts_is_only_refused() {
-    let mut config = common::config();
+    let mut config = super::common::config();
     config.gossip.epochs_per_robot_max = 1;
-    let mut wires = Wires::new(vec![common::agent_of(0, &config)]);
+    let mut wires = Wires::new(vec![super::common::agent_of(0, &config)]);
     let keyframes = [drive(0, 21), drive(21, 12)].concat();
     for keyframe in keyframes {
         wires.input(0, Input::Keyframe(keyframe));

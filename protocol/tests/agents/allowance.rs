@@ -1,9 +1,6 @@
 //! What an allowance in bytes changes for those who merge: nothing before they have, less after.
-#![allow(missing_docs)]
 
-mod common;
-
-use common::{Wires, World, agent_of, drive};
+use super::common::{Wires, World, agent_of, drive};
 use merganser_protocol::agent::io::{Event, Input};
 use merganser_protocol::time::Instant;
 use std::time::Duration;
@@ -12,7 +9,7 @@ use std::time::Duration;
 /// in all, and the pairs aligned.
 fn merge_at(further_bytes_per_sec: f64) -> (Option<Instant>, [usize; 2], usize) {
     let world = World::new(1);
-    let mut config = common::config();
+    let mut config = super::common::config();
     config.align.further_bytes_per_sec = further_bytes_per_sec;
     let mut wires = Wires::new((0..2).map(|k| agent_of(k, &config)).collect());
     let runs: Vec<_> = (0..2).map(|k| drive(&world, k, 40).0).collect();

@@ -1,9 +1,6 @@
 //! A long log is replaced by what still counts of it, and nobody notices but by the bytes.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a failed unwrap in a test is its report")]
 
-mod common;
-
-use common::{Wires, World, config, drive, identity, robot};
+use super::common::{Wires, World, config, drive, identity, robot};
 use merganser_protocol::agent::io::{Command, Event, Input, Record};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::time::Instant;
@@ -122,5 +119,5 @@ fn a_restart_and_a_late_joiner_find_the_same() {
 }
 
 fn robot_name(robot: &merganser_protocol::ids::RobotId) -> String {
-    (0..3).find(|k| common::robot(*k) == *robot).map(|k| common::NAMES[k].to_owned()).unwrap()
+    (0..3).find(|k| super::common::robot(*k) == *robot).map(|k| super::common::NAMES[k].to_owned()).unwrap()
 }

@@ -1,10 +1,7 @@
 //! What a robot remembers over a restart besides its facts: which run of the front end its epoch is of, and which pairs
 //! it tried in vain.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a test fails by panicking")]
 
-mod common;
-
-use common::{Wires, World, config, drive, identity};
+use super::common::{Wires, World, config, drive, identity};
 use merganser_protocol::agent::io::{Command, EpochReason, Event, Input, Record};
 use merganser_protocol::agent::{Agent, REFUSED_WAITING_MAX, Restored};
 use merganser_protocol::config::Config;
@@ -250,7 +247,7 @@ fn refusals_go_with_the_submaps_that_are_gone() {
 
 #[test]
 fn refusals_of_nobody_known_leave_the_disk_at_a_start() {
-    let frame = merganser_protocol::ids::FrameId { robot: common::robot(1), epoch: 1 };
+    let frame = merganser_protocol::ids::FrameId { robot: super::common::robot(1), epoch: 1 };
     let [i, j] = [0, 1].map(|index| SubmapId { frame, index });
     let records = vec![Record::Refused { i, j, evidence: Some(1) }, Record::Refused { i: j, j: i, evidence: Some(1) }];
     let wires = alone(records, &[]);

@@ -1,10 +1,7 @@
 //! A slow link (DESIGN §4): whatever two robots have to tell each other, no second carries more than the budget allows,
 //! poses keep their pace, facts come before blobs, and in the end all has come.
-#![allow(clippy::unwrap_used, reason = "a failed unwrap in a test is its report")]
 
-mod common;
-
-use common::{Wires, World, drive};
+use super::common::{Wires, World, drive};
 use ed25519_dalek::SigningKey;
 use merganser_protocol::agent::io::{AskToken, Command, Input, Output, QueryKind, Record};
 use merganser_protocol::agent::{Agent, Restored};
@@ -25,7 +22,7 @@ const PAYLOAD: usize = 300;
 const MESSAGE_MAX: f64 = 4_096.0;
 
 fn slow() -> Config {
-    let mut config = common::config();
+    let mut config = super::common::config();
     config.submap.keypoints = 1024;
     config.gossip.link_bytes_per_sec = RATE;
     config
@@ -33,14 +30,14 @@ fn slow() -> Config {
 
 /// A log of alpha's, of a kind that nobody knows.
 fn history(len: u32) -> Vec<Record> {
-    let frame = FrameId { robot: common::robot(0), epoch: 3 };
+    let frame = FrameId { robot: super::common::robot(0), epoch: 3 };
     let swarm = SwarmTag::of(&Name::new("test").unwrap());
     let mut previous = Hash::default();
     let entry = |seq| {
         let id = EntryId { frame, seq };
         let payload = vec![seq as u8; PAYLOAD];
         let content = EntryContent { swarm, id, kind: 99, floor: 0, previous, payload };
-        let entry = Entry::sign(&SigningKey::from_bytes(&common::secret(0)), content).unwrap();
+        let entry = Entry::sign(&SigningKey::from_bytes(&super::common::secret(0)), content).unwrap();
         previous = entry.hash();
         Record::Entry { id, bytes: entry.encode() }
     };
@@ -51,7 +48,7 @@ fn history(len: u32) -> Vec<Record> {
 fn two(config: &Config) -> Wires {
     let agent = |k, records| {
         let restored = Restored { records, fresh_epoch: 3 };
-        Agent::new(config.clone(), common::identity(k), 42, restored, Instant::ZERO).unwrap()
+        Agent::new(config.clone(), super::common::identity(k), 42, restored, Instant::ZERO).unwrap()
     };
     let mut wires = Wires::new(vec![agent(0, history(HISTORY)), agent(1, Vec::new())]);
     let world = World::new(1);
@@ -135,8 +132,9 @@ fn ask(agent: &mut Agent, now: Instant, kind: QueryKind, message: &Message) -> O
 
 #[test]
 fn whoever_asks_without_end_gets_no_more_than_there_is_room_for_and_silences_nothing_above() {
-    let mut first =
-        Wires::new(vec![Agent::new(slow(), common::identity(0), 42, Restored::default(), Instant::ZERO).unwrap()]);
+    let mut first = Wires::new(vec![
+        Agent::new(slow(), super::common::identity(0), 42, Restored::default(), Instant::ZERO).unwrap(),
+    ]);
     drive(&World::new(1), 0, 12).0.into_iter().for_each(|keyframe| first.input(0, Input::Keyframe(keyframe)));
     let records = first.disks.remove(0);
     let blobs = records.iter().filter_map(|record| match record {
@@ -146,8 +144,8 @@ fn whoever_asks_without_end_gets_no_more_than_there_is_room_for_and_silences_not
     let blob = blobs.max_by_key(Vec::len).unwrap();
     assert!(blob.len() as f64 > burst_bytes(RATE));
     let restored = Restored { records, fresh_epoch: 3 };
-    let mut agent = Agent::new(slow(), common::identity(0), 42, restored, Instant::ZERO).unwrap();
-    agent.handle(Instant::ZERO, Input::Neighbour { robot: common::robot(1), up: true });
+    let mut agent = Agent::new(slow(), super::common::identity(0), 42, restored, Instant::ZERO).unwrap();
+    agent.handle(Instant::ZERO, Input::Neighbour { robot: super::common::robot(1), up: true });
     let request = Message::BlobRequest { hash: Hash::of(&blob), offset: 0, len: 16_384 };
     let mut lens = Vec::new();
     for _ in 0..100 {

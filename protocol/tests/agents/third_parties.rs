@@ -1,9 +1,6 @@
 //! What a third party says of two robots keeps these from nothing.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a test fails by panicking")]
 
-mod common;
-
-use common::{Wires, World, config, drive, identity, robot, secret};
+use super::common::{Wires, World, config, drive, identity, robot, secret};
 use merganser_protocol::agent::io::{Input, Record};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};

@@ -1,11 +1,4 @@
 //! A tiny shell for tests: agents joined by perfect wires, jobs run inline, a world of random boxes.
-#![allow(
-    dead_code,
-    missing_docs,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    reason = "a failed unwrap in a test is its report"
-)]
 
 use merganser_protocol::agent::io::{Channel, Event, Input, Output, QueryKind, Record};
 use merganser_protocol::agent::{Agent, Identity, Restored};

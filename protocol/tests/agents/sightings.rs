@@ -1,10 +1,7 @@
 //! What one robot sees of another is carried to anchors with an uncertainty that it can stand by, though both moved on
 //! since the last keyframe and the last beacon.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "a failed unwrap in a test is its report")]
 
-mod common;
-
-use common::{Wires, World, agent, drive, name, robot};
+use super::common::{Wires, World, agent, drive, name, robot};
 use merganser_protocol::agent::io::{Channel, Input, PositionSighting, Record, Sighting};
 use merganser_protocol::agent::{Restored, SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
 use merganser_protocol::geometry::{Covariance, Se3};

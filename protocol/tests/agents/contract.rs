@@ -1,9 +1,6 @@
 //! The contract between the core and its shells, and what the core promises under bad input.
-#![allow(missing_docs)]
 
-mod common;
-
-use common::{Wires, World, agent, drive, name, robot};
+use super::common::{Wires, World, agent, drive, name, robot};
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Output, QueryKind, Record, Sighting};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::ids::{FrameId, Hash, Name, RobotId};
@@ -16,7 +13,7 @@ use merganser_protocol::wire::messages::Message;
 use std::time::Duration;
 
 fn name_of_swarm() -> Name {
-    common::identity(0).swarm
+    super::common::identity(0).swarm
 }
 
 fn drain(agent: &mut Agent) -> Vec<Output> {
@@ -108,7 +105,7 @@ fn three_robots_merge_and_hold_the_same_map() {
     }
     let frames = wires.agents[0].snapshot(wires.now).frames;
     for (k, (_, truth)) in runs.iter().enumerate().skip(1) {
-        let frame = frames.frames.iter().find(|f| f.robot == common::NAMES[k]).unwrap();
+        let frame = frames.frames.iter().find(|f| f.robot == super::common::NAMES[k]).unwrap();
         let found = frame.t_own_frame.as_ref().unwrap();
         let t_own_frame = runs[0].1[0].inverse() * truth[0];
         let error = nalgebra::Vector3::from(found.pose.translation) - t_own_frame.translation;
@@ -119,11 +116,11 @@ fn three_robots_merge_and_hold_the_same_map() {
 #[test]
 fn blobs_come_in_paced_pieces_and_whole() {
     let world = World::new(1);
-    let mut config = common::config();
+    let mut config = super::common::config();
     config.submap.keypoints = 1024;
     config.gossip.blob_bytes_per_sec = 50_000.0;
     let pause = Duration::from_secs_f64(BLOB_PIECE_LEN as f64 / config.gossip.blob_bytes_per_sec);
-    let mut wires = Wires::new((0..2).map(|k| common::agent_of(k, &config)).collect());
+    let mut wires = Wires::new((0..2).map(|k| super::common::agent_of(k, &config)).collect());
     for k in 0..2 {
         drive(&world, k, 12).0.into_iter().for_each(|keyframe| wires.input(k, Input::Keyframe(keyframe)));
         wires.input(k, Input::Command(Command::Flush));
@@ -152,7 +149,7 @@ fn ten_thousand_facts_of_strangers_are_counted_reported_once_and_forgotten() {
     let key = ed25519_dalek::SigningKey::from_bytes(&[99; 32]);
     let stranger = RobotId::of_key(&key.verifying_key().to_bytes());
     let roster = [(Name::new("stranger").unwrap(), key.verifying_key().to_bytes())];
-    let mut theirs = Replica::new(&swarm, roster, &common::config().gossip).unwrap();
+    let mut theirs = Replica::new(&swarm, roster, &super::common::config().gossip).unwrap();
     let verdict = Fact::Verdict(VerdictFact {
         alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: stranger, epoch: 1 }, seq: 0 },
         outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
@@ -189,9 +186,9 @@ fn ten_thousand_facts_of_strangers_are_counted_reported_once_and_forgotten() {
 fn a_slow_disk_bounds_what_waits_for_it_and_nothing_is_lost() {
     const MAX: u64 = 1024;
     let mut agent = agent(0, Restored::default());
-    let key = ed25519_dalek::SigningKey::from_bytes(&common::secret(1));
-    let roster = [(name(1), common::public(1))];
-    let mut theirs = Replica::new(&name_of_swarm(), roster, &common::config().gossip).unwrap();
+    let key = ed25519_dalek::SigningKey::from_bytes(&super::common::secret(1));
+    let roster = [(name(1), super::common::public(1))];
+    let mut theirs = Replica::new(&name_of_swarm(), roster, &super::common::config().gossip).unwrap();
     let verdict = Fact::Verdict(VerdictFact {
         alignment: merganser_protocol::ids::EntryId { frame: FrameId { robot: robot(1), epoch: 1 }, seq: 0 },
         outcome: VerdictOutcome::Refused(RefusalReason::NoConsensus),
@@ -397,8 +394,8 @@ fn the_same_inputs_give_the_same_outputs() {
 
 #[test]
 fn the_roster_must_hold_the_robot_itself() {
-    let mut identity = common::identity(0);
+    let mut identity = super::common::identity(0);
     identity.roster.remove(&name(0));
-    let result = Agent::new(common::config(), identity, 0, Restored::default(), Instant::ZERO);
+    let result = Agent::new(super::common::config(), identity, 0, Restored::default(), Instant::ZERO);
     assert!(result.is_err());
 }

@@ -1,9 +1,6 @@
 //! Epochs: what this robot wrote before its store was lost is never written on, and there is an end to them.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a test fails by panicking")]
 
-mod common;
-
-use common::{Wires, World, agent, drive, name, robot};
+use super::common::{Wires, World, agent, drive, name, robot};
 use merganser_protocol::agent::io::{Channel, Command, Event, Input, Output, Record};
 use merganser_protocol::agent::{Agent, CLOCK_BACK_KEYFRAMES, Restored};
 use merganser_protocol::ids::{EntryId, FrameId};
@@ -29,9 +26,9 @@ fn verdict(seq: u32) -> Fact {
 
 /// What alpha wrote into an epoch, and where this begins to differ.
 fn past(epoch: u32, facts: impl IntoIterator<Item = u32>) -> Vec<Vec<u8>> {
-    let key = ed25519_dalek::SigningKey::from_bytes(&common::secret(0));
-    let members = [(name(0), common::public(0))];
-    let mut past = Replica::new(&common::identity(0).swarm, members, &common::config().gossip).unwrap();
+    let key = ed25519_dalek::SigningKey::from_bytes(&super::common::secret(0));
+    let members = [(name(0), super::common::public(0))];
+    let mut past = Replica::new(&super::common::identity(0).swarm, members, &super::common::config().gossip).unwrap();
     facts.into_iter().map(|seq| past.append(&key, epoch, &verdict(seq)).unwrap().encode()).collect()
 }
 
@@ -61,9 +58,9 @@ fn writes(wires: &mut Wires) {
 #[test]
 fn a_robot_at_its_last_epoch_writes_and_beyond_it_only_listens_and_says_why() {
     let (keyframes, _) = drive(&World::new(1), 0, 8);
-    let mut config = common::config();
+    let mut config = super::common::config();
     config.gossip.epochs_per_robot_max = 2;
-    let mut wires = Wires::new(vec![common::agent_of(0, &config)]);
+    let mut wires = Wires::new(vec![super::common::agent_of(0, &config)]);
     let drive_and_end = |wires: &mut Wires| {
         keyframes.iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe.clone())));
         wires.input(0, Input::Command(Command::NewEpoch));
@@ -144,10 +141,10 @@ fn an_own_past_with_two_histories_is_closed_whoever_proves_it() {
 
 #[test]
 fn own_epochs_that_come_back_can_be_too_many_which_is_told_once() {
-    let mut config = common::config();
+    let mut config = super::common::config();
     config.gossip.epochs_per_robot_max = 2;
     let restored = Restored { records: vec![], fresh_epoch: 12 };
-    let alpha = Agent::new(config, common::identity(0), 0, restored, Instant::ZERO).unwrap();
+    let alpha = Agent::new(config, super::common::identity(0), 0, restored, Instant::ZERO).unwrap();
     let mut wires = Wires::new(vec![alpha]);
     hear(&mut wires, &past(3, 0..2));
     assert!(!wires.agents[0].status().receive_only && !is_told(&wires));
