@@ -10,7 +10,7 @@
 //! Only `handle` changes anything. Heavy work is an output ([`agent::io::Output::Run`]) whose result comes back as an
 //! input; the shell runs it where it likes, or not at all for a while. Records become facts for others only after the
 //! shell says that they are durable. An error is somebody's bad input, counted and reported as an event; a panic is our
-//! bug. `tests/agent_contract.rs` holds the core to all of this.
+//! bug. `tests/agents/contract.rs` holds the core to all of this.
 //!
 //! Modules point one way: `time, ids, config` ← `geometry` ← `wire` ← `submap, align, estimate, replica` ←
 //! `gossip` ← `agent`.

@@ -9,6 +9,7 @@ use crate::swarm::{Outcome, Swarm};
 use anyhow::Context;
 use merganser_protocol::agent::Agent;
 use std::io::Write;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -23,7 +24,7 @@ pub struct RunArgs {
     /// Run a band of seeds, FIRST..END (without END)
     #[arg(long, value_name = "FIRST..END", value_parser = parse_band)]
     pub seeds: Option<Band>,
-    /// Seeds of a band run at once; all processors if absent
+    /// Seeds of a band run at once, so that each takes longer by itself; all processors if absent
     #[arg(long, value_name = "N", requires = "seeds", value_parser = clap::value_parser!(u16).range(1..=256))]
     pub jobs: Option<u16>,
     /// Write report.json and trajectories.svg here (a folder per seed for a band)
@@ -54,19 +55,27 @@ pub fn run(args: &RunArgs) -> anyhow::Result<bool> {
     };
     let bar = progress_bar(band.1 - band.0, "seeds")?;
     let (mut good, mut errors, failed) = (true, Vec::new(), AtomicBool::new(false));
+    let fails = || failed.store(true, Ordering::Relaxed);
     let work = |seed| {
         if failed.load(Ordering::Relaxed) {
             return None;
         }
-        let told = run_seed(args, &scenario, seed, |_, _| {});
-        failed.fetch_or(told.is_err(), Ordering::Relaxed);
+        // A panic is told like an error, with its seed: the other jobs must not go on for hours before it is seen.
+        let told = catch_unwind(AssertUnwindSafe(|| run_seed(args, &scenario, seed, |_, _| {})));
+        let told = told.unwrap_or_else(|_| Err(anyhow::anyhow!("seed {seed} panicked")));
+        if told.is_err() {
+            fails();
+        }
         bar.inc(1);
         Some(told)
     };
     let print = |told: Told| bar.suspend(|| say(&told.text)).map(|()| told.good);
     band.for_each(jobs(args.jobs), work, |_, told| match told.and_then(|told| Ok(print(told)?)) {
         Ok(held) => good &= held,
-        Err(error) => errors.push(error),
+        Err(error) => {
+            fails();
+            errors.push(error);
+        }
     });
     bar.finish_and_clear();
     errors.into_iter().next().map_or(Ok(good), Err)

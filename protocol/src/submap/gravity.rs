@@ -169,6 +169,9 @@ fn turn_variances(motions: &[PoseWithCovariance], anchor: usize, keyframes: usiz
 const TILT_SIGMA_ROUGH: f64 = 0.06;
 /// ...and polished ones hardly by one.
 const TILT_SIGMA: f64 = 0.02;
+/// Who knows the vertical less well than this, rad, had better take the ground from what is seen: over a hundred voxels it
+/// would be three off.
+const GROUND_SIGMA_MAX: f64 = 0.03;
 
 /// Both verticals of a pair of submaps.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -223,9 +226,9 @@ impl Upright {
         self.0.is_none_or(|known| known.allow(&pose.rotation, TILT_SIGMA))
     }
 
-    /// Which way is up in my frame, of length 1.
+    /// Which way is up in my frame, of length 1, if it is known well enough to lay shifts along the ground.
     pub(super) fn up(&self) -> Option<&Vector3<f64>> {
-        self.0.as_ref().map(|known| known.mine.direction())
+        self.0.as_ref().map(|known| &known.mine).filter(|up| up.sigma <= GROUND_SIGMA_MAX).map(Up::direction)
     }
 }
 

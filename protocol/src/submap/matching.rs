@@ -17,9 +17,9 @@ use pulp::Arch;
 pub const COUNTERPARTS: usize = 4;
 /// Features nearest in descriptor space among which they are sought.
 const SHORTLIST: usize = 40;
-/// Nearest features that are kept of each keypoint, to choose from again without those that lie in one place: on a surface
-/// of one feature a voxel, a place of six voxels' radius holds 113.
-const NEAREST: usize = 160;
+/// Nearest features that are kept of each keypoint, to choose from again without those that lie in one place: where two
+/// surfaces meet, with one feature a voxel, a place of six voxels' radius holds 226.
+const NEAREST: usize = 280;
 /// Counterparts of one keypoint are at least this far from each other, voxels.
 const APART_VOXELS: f64 = 3.0;
 
@@ -62,8 +62,8 @@ pub fn match_keypoints(theirs: &Keypoints, mine: &Features) -> Matches {
 }
 
 impl Pairings {
-    /// The counterparts that each keypoint has if those are left out that `is_out` says, by positions of keypoint and
-    /// feature.
+    /// The counterparts that each keypoint has among those nearest to it ([`NEAREST`] were kept) without those that
+    /// `is_out` says, by positions of keypoint and feature.
     pub fn except(
         &self,
         mine: &Features,
