@@ -124,8 +124,9 @@ impl From<&LandmarkError> for RefusalReason {
             LandmarkError::TooFew { .. } => Self::TooFew,
             LandmarkError::NoConsensus { .. } => Self::NoConsensus,
             LandmarkError::LabelsLie { .. } => Self::PoorFit,
-            LandmarkError::Ambiguous { .. } | LandmarkError::Mirror { .. } => Self::Ambiguous,
-            LandmarkError::Degenerate { .. } => Self::Degenerate,
+            LandmarkError::Ambiguous { .. } => Self::Ambiguous,
+            // Which says nothing of other places.
+            LandmarkError::Mirror { .. } | LandmarkError::Degenerate { .. } => Self::Degenerate,
         }
     }
 }
