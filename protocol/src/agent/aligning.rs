@@ -5,7 +5,7 @@ use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Look, Measured};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
-use super::negotiation::{FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work};
+use super::negotiation::{FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work, may_repeat};
 use super::promise::Guess;
 use super::ranking::Proposal;
 use super::shortlist::Candidate;
@@ -14,7 +14,7 @@ use crate::geometry::Relative;
 use crate::ids::{EntryId, Hash, RobotId, SubmapId};
 use crate::submap::{Keypoints, Summary, Verticals};
 use crate::time::Instant;
-use crate::wire::fact::{AlignmentFact, Fact, RefusalReason, ScaleKind, VerdictFact, VerdictOutcome};
+use crate::wire::fact::{AlignmentFact, Fact, LookalikeFact, RefusalReason, ScaleKind, VerdictFact, VerdictOutcome};
 use core::time::Duration;
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -36,7 +36,7 @@ impl Agent {
                     self.on_fact(EntryId { seq: one.seq, ..id }, &one.fact);
                 }
             }
-            Fact::Sighting(_) | Fact::Position(_) => {}
+            Fact::Sighting(_) | Fact::Position(_) | Fact::Lookalike(_) => {}
         }
     }
 
@@ -307,7 +307,10 @@ impl Agent {
                 self.tell_try(&work, guess, outcome.is_ok());
                 match outcome {
                     Ok(measured) => self.propose(&work, &measured),
-                    Err(_) => self.note_refusal(pair_of(work.mine, work.theirs)),
+                    Err(reason) => {
+                        self.note_refusal(pair_of(work.mine, work.theirs));
+                        self.note_lookalike(&work, reason);
+                    }
                 }
             }
             Purpose::Verify(id) => {
@@ -321,6 +324,17 @@ impl Agent {
                 };
                 self.write_verdict(id, verdict);
             }
+        }
+    }
+
+    /// Two of our own submaps fit in several ways: all are told so, unless it is plain that our place does not repeat itself.
+    fn note_lookalike(&mut self, work: &Work, reason: RefusalReason) {
+        let (i, j) = pair_of(work.mine, work.theirs);
+        let frame = self.me.frame;
+        let [told, held] = [self.knowledge.lookalikes_of(frame), self.knowledge.loops_of(frame)];
+        let ours = i.frame == frame && j.frame == frame;
+        if ours && reason == RefusalReason::Ambiguous && may_repeat(told, held) {
+            self.write(frame.epoch, &Fact::Lookalike(LookalikeFact { i: i.index, j: j.index }));
         }
     }
 

@@ -10,10 +10,11 @@ use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::Summary;
 use crate::time::Stamp;
 use crate::wire::fact::{
-    AlignmentFact, CarriedFact, Fact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact,
-    VerdictOutcome,
+    AlignmentFact, CarriedFact, Fact, LookalikeFact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact,
+    VerdictFact, VerdictOutcome,
 };
 use core::num::NonZero;
+use core::ops::RangeInclusive;
 use nalgebra::Vector3;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -87,6 +88,7 @@ pub struct Knowledge {
     verdicts: BTreeMap<EntryId, BTreeMap<EntryId, VerdictFact>>,
     sightings: BTreeMap<EntryId, SightingFact>,
     positions: BTreeMap<EntryId, PositionFact>,
+    lookalikes: BTreeMap<EntryId, LookalikeFact>,
     /// Derived, kept because it is asked often: what [`Knowledge::judge`] says of each alignment.
     agreements: BTreeMap<EntryId, Agreement>,
 }
@@ -123,6 +125,9 @@ impl Knowledge {
                     self.positions.insert(id, position);
                 }
             }
+            Fact::Lookalike(pair) => {
+                self.lookalikes.insert(id, pair);
+            }
         }
     }
 
@@ -132,6 +137,7 @@ impl Knowledge {
         self.submaps.retain(|_, known| !gone(&known.entry));
         self.sightings.retain(|id, _| !gone(id));
         self.positions.retain(|id, _| !gone(id));
+        self.lookalikes.retain(|id, _| !gone(id));
         let entries = EntryId { frame, seq: 0 }..EntryId { frame, seq: floor };
         let alignments: Vec<EntryId> = self.alignments.range(entries).map(|(id, _)| *id).collect();
         for id in alignments {
@@ -327,7 +333,7 @@ impl Knowledge {
     }
 
     /// Between which frames there are pairs of submaps of which one end found an alignment, and the other that there are
-    /// several; how many.
+    /// several; how many. Of a frame and itself, pairs that fit in several ways by their owner's word.
     fn ambiguous(&self) -> BTreeMap<(FrameId, FrameId), usize> {
         let is_ambiguous = |id: &EntryId| {
             let verdict = self.alignments.get(id).and_then(|fact| self.verdict(*id, fact));
@@ -341,7 +347,23 @@ impl Knowledge {
                 *counts.entry((a, b)).or_default() += 1;
             }
         }
+        let within: BTreeSet<(FrameId, u32, u32)> =
+            self.lookalikes.iter().map(|(id, pair)| (id.frame, pair.i, pair.j)).collect();
+        for (frame, ..) in within {
+            *counts.entry((frame, frame)).or_default() += 1;
+        }
         counts
+    }
+
+    /// How many lookalikes were told of within a frame.
+    pub(super) fn lookalikes_of(&self, frame: FrameId) -> usize {
+        self.lookalikes.range(entries_of(frame)).count()
+    }
+
+    /// How many loop closures were stated within a frame.
+    pub(super) fn loops_of(&self, frame: FrameId) -> usize {
+        let stated = self.alignments.range(entries_of(frame));
+        stated.filter(|(_, fact)| fact.i.frame == frame && fact.j.frame == frame).count()
     }
 
     /// Of all alignments of two submaps the one that counts: the first that both endpoints agree on.
@@ -373,6 +395,11 @@ impl Knowledge {
         }
         chains.into_iter().filter(|(_, (chain, _))| !chain.is_empty()).map(|(f, (chain, _))| (f, chain)).collect()
     }
+}
+
+/// Places of all entries of a frame.
+fn entries_of(frame: FrameId) -> RangeInclusive<EntryId> {
+    EntryId { frame, seq: 0 }..=EntryId { frame, seq: u32::MAX }
 }
 
 /// Whether the observer says where another robot is, and nobody else does.

@@ -2,7 +2,7 @@ use super::*;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use crate::ids::Hash;
 use crate::time::Stamp;
-use crate::wire::fact::{RefusalReason, ScaleKind};
+use crate::wire::fact::{CondensedFact, RefusalReason, ScaleKind};
 use nalgebra::Vector3;
 
 fn frame(robot: u8) -> FrameId {
@@ -128,6 +128,26 @@ fn an_endpoint_that_sees_two_ways_tells_of_its_two_frames() {
     assert_eq!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous), again.clone(), twice]), both);
     let agreed = (entry(1, 3), verdict(again.0, 3.0, 0.02));
     assert!(count(&[stated.clone(), refused(2, RefusalReason::Ambiguous), again.clone(), agreed]).is_empty());
+}
+
+#[test]
+fn who_takes_its_own_places_for_others_tells_of_its_frame_alone() {
+    let alike = |robot, seq, i, j| (entry(robot, seq), Fact::Lookalike(LookalikeFact { i, j }));
+    let told = [alike(1, 1, 0, 7), alike(1, 2, 0, 8), alike(1, 3, 0, 7), alike(2, 1, 0, 7)];
+    let mut known = knowledge(&told);
+    let counts = BTreeMap::from([((frame(1), frame(1)), 2), ((frame(2), frame(2)), 1)]);
+    assert_eq!(problem(&known).ambiguous, counts, "twice told is told once");
+    assert_eq!((known.lookalikes_of(frame(1)), known.lookalikes_of(frame(3))), (3, 0));
+    known.forget_below(frame(1), 2);
+    assert_eq!(known.lookalikes_of(frame(1)), 2);
+    let carried = [(1, 0, 7), (2, 0, 8)].map(|(seq, i, j)| CarriedFact {
+        seq,
+        after: None,
+        fact: Fact::Lookalike(LookalikeFact { i, j }),
+    });
+    known.forget_below(frame(1), 9);
+    known.absorb(entry(1, 9), Fact::Condensed(CondensedFact { carried: carried.into() }));
+    assert_eq!(problem(&known).ambiguous, counts, "carried on");
 }
 
 #[test]

@@ -77,7 +77,7 @@ pub struct MapProblem {
     /// not listed.
     pub gone: BTreeMap<SubmapId, u32>,
     /// Between two frames, `a < b`: pairs of submaps of which one end found an alignment, and the other end that there are
-    /// several. Places that repeat themselves show by it.
+    /// several. Within one, `a = b`: pairs of its owner's that fit in several ways. Places that repeat themselves show by it.
     pub ambiguous: BTreeMap<(FrameId, FrameId), usize>,
 }
 

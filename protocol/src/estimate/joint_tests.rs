@@ -11,6 +11,7 @@ use crate::snapshot::PairStatus;
 use nalgebra::Vector3;
 use rand::RngExt;
 use rand::seq::SliceRandom;
+use std::collections::BTreeMap;
 
 #[test]
 fn noiseless_facts_give_back_the_truth() {
@@ -308,8 +309,9 @@ fn a_frame_that_takes_its_places_for_others_merges_with_none() {
     let (merged, ambiguous) = ((PairStatus::Merged, 5), (PairStatus::Ambiguous, 0));
     // Closures of the first frame: as found at the same place, though the way between is long; true; and off by a share of
     // the way, as where odometry is worse than it says.
-    let status = |elsewhere: usize, held: usize, drifted: usize| {
-        let mut problem = world.problem.clone();
+    let status_told = |told: usize, elsewhere: usize, held: usize, drifted: usize| {
+        let ambiguous = BTreeMap::from([((frame(0), frame(0)), told)]);
+        let mut problem = MapProblem { ambiguous, ..world.problem.clone() };
         let mut close = |k: usize, t_i_j: Se3| {
             let t_i_j = Relative::Metric(PoseWithCovariance { pose: t_i_j, covariance: sigmas(0.02, 0.005) });
             let entry = EntryId { frame: frame(0), seq: 1000 + problem.alignments.len() as u32 };
@@ -325,8 +327,15 @@ fn a_frame_that_takes_its_places_for_others_merges_with_none() {
         assert_eq!(refused, elsewhere + drifted);
         map.pairs().iter().map(|pair| (pair.status, pair.used)).collect::<Vec<_>>()
     };
+    let status = |elsewhere, held, drifted| status_told(0, elsewhere, held, drifted);
     assert_eq!(status(0, 0, 0), [merged; 3]);
     assert_eq!(status(1, 0, 0), [merged; 3], "one may be chance");
+    // Places that fit in several ways, by the owner's word, are as good as those that its odometry refutes.
+    assert_eq!(status_told(1, 0, 0, 0), [merged; 3], "one may be chance");
+    assert_eq!(status_told(2, 0, 0, 0), [ambiguous, ambiguous, merged]);
+    assert_eq!(status_told(1, 1, 2, 0), [ambiguous, ambiguous, merged]);
+    assert_eq!(status_told(1, 1, 3, 0), [merged; 3], "most were right");
+    assert_eq!(status_told(usize::MAX, 2, 0, 0), [ambiguous, ambiguous, merged]);
     assert_eq!(status(2, 0, 0), [ambiguous, ambiguous, merged]);
     assert_eq!(status(2, 3, 0), [merged; 3], "most were right");
     assert_eq!(status(0, 0, 3), [merged; 3], "no place is taken for another");

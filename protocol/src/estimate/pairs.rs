@@ -25,9 +25,9 @@ const WEIGHED_MAX: usize = 32;
 /// every shelf is the same, false merges had 1 to 2.3; elsewhere LiDARs have up to 0.2 and landmarks up to 0.7.
 const AMBIGUOUS_SHARE: f64 = 0.8;
 
-/// Loop closures of one frame that its odometry refutes, from which on they tell of a place that repeats itself: one may be
-/// chance.
-const REFUTED_MIN: usize = 2;
+/// Loop closures of one frame that its odometry refutes, or that fit in several ways, from which on they tell of a place that
+/// repeats itself: one may be chance.
+const REPEATED_MIN: usize = 2;
 
 /// A pair of frames, `a < b`, and what its own alignments say.
 pub(super) struct Pair {
@@ -57,7 +57,8 @@ pub(super) struct Outcome {
 
 /// Runs the consensus on every pair, and marks the intake's edges accordingly.
 pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pair> {
-    let repeat = repeating(&loops::gate(intake));
+    let loops = loops::gate(intake);
+    let repeat = repeating(&loops, &intake.ambiguous);
     let mut members: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
     for (k, edge) in intake.edges.iter().enumerate() {
         let (i, j) = (edge.measurement.i.frame, edge.measurement.j.frame);
@@ -84,11 +85,17 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
     pairs
 }
 
-/// Frames in which about as many places were taken for others, as their odometry tells, as were seen again: what looks the
-/// same there is not.
-fn repeating(loops: &BTreeMap<FrameId, Loops>) -> BTreeSet<FrameId> {
-    let repeats = |of: &Loops| of.refuted >= REFUTED_MIN && of.refuted as f64 >= AMBIGUOUS_SHARE * of.held as f64;
-    loops.iter().filter(|(_, of)| repeats(of)).map(|(frame, _)| *frame).collect()
+/// Frames in which about as many places look like others, as was told (`ambiguous`) or as their odometry tells, as were seen
+/// again: what looks the same there is not. *Measured* in simulated halls, drives of 20 to 120 s: of the loops looked at 75 to
+/// 100 % where every shelf or room is the same; 0 of 418 elsewhere, and up to 3 of 57 in rows of cells that are not quite alike.
+fn repeating(loops: &BTreeMap<FrameId, Loops>, ambiguous: &BTreeMap<(FrameId, FrameId), usize>) -> BTreeSet<FrameId> {
+    let repeats = |frame: &FrameId| {
+        let Loops { held, refuted } = loops.get(frame).copied().unwrap_or_default();
+        let repeated = ambiguous.get(&(*frame, *frame)).copied().unwrap_or(0).saturating_add(refuted);
+        repeated >= REPEATED_MIN && repeated as f64 >= AMBIGUOUS_SHARE * held as f64
+    };
+    let within = ambiguous.keys().filter(|(a, b)| a == b).map(|(frame, _)| *frame);
+    loops.keys().copied().chain(within).filter(repeats).collect()
 }
 
 /// `t_world_anchor` of every anchor: odometry, laid out along the spanning forest. Where a tree holds a frame in metres the

@@ -22,6 +22,8 @@ pub enum Fact {
     Condensed(CondensedFact),
     /// Where another robot was seen, not how it was turned.
     Position(PositionFact),
+    /// Two of the writer's own submaps that look alike in more ways than one.
+    Lookalike(LookalikeFact),
 }
 
 /// Whether a frame's unit is the metre.
@@ -114,7 +116,7 @@ pub enum RefusalReason {
     NoConsensus,
     /// Two different alignments explain the data about equally well.
     Ambiguous,
-    /// The geometry leaves a direction undetermined.
+    /// The geometry leaves a direction undetermined, or a mirror image looks the same.
     Degenerate,
     /// The alignment does not fit the rest of the two submaps.
     PoorFit,
@@ -151,6 +153,16 @@ pub struct PositionFact {
     pub p_j: [f32; 3],
     /// Of the one less the other, along the axes of `i`'s anchor, m².
     pub covariance: Covariance<3>,
+}
+
+/// Two submaps of the frame that the entry is of, which its owner looked at for a loop and which fit in several ways
+/// ([`RefusalReason::Ambiguous`]): a frame that has many of them repeats itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LookalikeFact {
+    /// Index of the earlier one.
+    pub i: u32,
+    /// Index of the later one.
+    pub j: u32,
 }
 
 /// A part of what still counts of the entries below the writer's floor (DESIGN §3, §7): facts that are carried on, each

@@ -122,6 +122,7 @@ fn fact(of: &Fact) -> Value {
             "p_j": f.p_j,
             "covariance": upper_triangle(f.covariance.matrix()),
         }),
+        Fact::Lookalike(f) => json!({ "i": f.i, "j": f.j }),
         Fact::Condensed(f) => json!({
             "carried": f.carried.iter().map(|one| json!({
                 "seq": one.seq,

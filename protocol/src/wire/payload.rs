@@ -4,7 +4,8 @@
 
 use super::condensed::RawCondensed;
 use super::fact::{
-    AlignmentFact, Fact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
+    AlignmentFact, Fact, LookalikeFact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact,
+    VerdictOutcome,
 };
 use super::frame::to_bytes;
 use super::limits::{self, LENGTH_MAX, PAYLOAD_LEN_MAX, SUMMARY_LEN_MAX};
@@ -28,6 +29,8 @@ pub const KIND_SIGHTING: u8 = 4;
 pub const KIND_CONDENSED: u8 = 5;
 /// Entry kind of a [`PositionFact`].
 pub const KIND_POSITION: u8 = 6;
+/// Entry kind of a [`LookalikeFact`].
+pub const KIND_LOOKALIKE: u8 = 7;
 
 /// Why a payload is no fact, or a fact cannot be written. No state changes.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -90,6 +93,7 @@ impl Fact {
             Self::Sighting(_) => KIND_SIGHTING,
             Self::Condensed(_) => KIND_CONDENSED,
             Self::Position(_) => KIND_POSITION,
+            Self::Lookalike(_) => KIND_LOOKALIKE,
         }
     }
 
@@ -102,6 +106,7 @@ impl Fact {
             KIND_SIGHTING => "sighting",
             KIND_CONDENSED => "condensed",
             KIND_POSITION => "position",
+            KIND_LOOKALIKE => "lookalike",
             _ => "unknown",
         }
     }
@@ -151,6 +156,7 @@ enum Raw {
     Sighting(RawSighting),
     Condensed(RawCondensed),
     Position(RawPosition),
+    Lookalike(RawLookalike),
 }
 
 impl Raw {
@@ -162,6 +168,7 @@ impl Raw {
             Fact::Sighting(f) => Self::Sighting(RawSighting::of(f)?),
             Fact::Condensed(f) => Self::Condensed(RawCondensed::of(f)?),
             Fact::Position(f) => Self::Position(RawPosition::of(f)?),
+            Fact::Lookalike(f) => Self::Lookalike(RawLookalike::of(f)?),
         })
     }
 
@@ -173,6 +180,7 @@ impl Raw {
             Self::Sighting(raw) => Fact::Sighting(raw.parse()?),
             Self::Condensed(raw) => Fact::Condensed(raw.parse()?),
             Self::Position(raw) => Fact::Position(raw.parse()?),
+            Self::Lookalike(raw) => Fact::Lookalike(raw.parse()?),
         })
     }
 
@@ -185,6 +193,7 @@ impl Raw {
             Self::Sighting(raw) => to_bytes(raw),
             Self::Condensed(raw) => to_bytes(raw),
             Self::Position(raw) => to_bytes(raw),
+            Self::Lookalike(raw) => to_bytes(raw),
         }
     }
 
@@ -196,6 +205,7 @@ impl Raw {
             KIND_SIGHTING => Self::Sighting(whole(bytes)?),
             KIND_CONDENSED => Self::Condensed(whole(bytes)?),
             KIND_POSITION => Self::Position(whole(bytes)?),
+            KIND_LOOKALIKE => Self::Lookalike(whole(bytes)?),
             other => return Err(FactError::UnknownKind(other)),
         })
     }
@@ -416,6 +426,24 @@ impl RawPosition {
         let covariance = self.covariance.parse().map_err(why)?;
         let (p_i, p_j) = (point(self.p_i, "p_i")?, point(self.p_j, "p_j")?);
         Ok(PositionFact { stamp: self.stamp, i: self.i, j: self.j, p_i, p_j, covariance })
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct RawLookalike {
+    i: u32,
+    j: u32,
+}
+
+impl RawLookalike {
+    fn of(f: &LookalikeFact) -> Result<Self, FactError> {
+        check(f.i < f.j, "j", "must be a later submap than i")?;
+        Ok(Self { i: f.i, j: f.j })
+    }
+
+    fn parse(&self) -> Result<LookalikeFact, FactError> {
+        check(self.i < self.j, "j", "must be a later submap than i")?;
+        Ok(LookalikeFact { i: self.i, j: self.j })
     }
 }
 

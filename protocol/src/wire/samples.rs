@@ -123,6 +123,7 @@ samples! {
                 covariance: Covariance::from_sigmas([0.25, 0.125, 0.5]).unwrap(),
             })
         }
+        Fact::Lookalike(_) => { "lookalike" => Fact::Lookalike(LookalikeFact { i: 7, j: 300 }) }
         Fact::Submap(SubmapFact { scale: ScaleKind::Metric, keyframes: Some(_), .. }) => {
             "submap_counted" => counted(submap_fact(ScaleKind::Metric))
         }

@@ -439,7 +439,9 @@ fn fact() -> impl Strategy<Value = Fact> {
         let covariance = Covariance::new_or_wider(t.covariance.matrix().fixed_view::<3, 3>(3, 3).into_owned());
         Fact::Position(PositionFact { stamp: Stamp(stamp), i, j, p_i, p_j, covariance })
     });
-    prop_oneof![submap, alignment, verdict, sighting, position]
+    let lookalike = (0..u32::MAX).prop_flat_map(|i| (Just(i), i + 1..=u32::MAX));
+    let lookalike = lookalike.prop_map(|(i, j)| Fact::Lookalike(LookalikeFact { i, j }));
+    prop_oneof![submap, alignment, verdict, sighting, position, lookalike]
 }
 
 proptest! {

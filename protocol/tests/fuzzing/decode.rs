@@ -112,6 +112,7 @@ fn check_fact(kind: u8, payload: &[u8], meter: &impl Meter) {
             assert!(f.i != f.j && f.p_i.iter().chain(&f.p_j).all(|x| x.is_finite()));
             assert!(f.covariance.matrix().symmetric_eigenvalues().min() > 0.0);
         }
+        Fact::Lookalike(f) => assert!(f.i < f.j),
         Fact::Condensed(f) => {
             assert!((1..=CARRIED_MAX).contains(&f.carried.len()) && f.carried.is_sorted_by(|a, b| a.seq < b.seq));
             for one in f.carried {

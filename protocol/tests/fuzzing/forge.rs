@@ -9,8 +9,8 @@ use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::{
-    AlignmentFact, CarriedFact, CondensedFact, Fact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact,
-    VerdictFact, VerdictOutcome,
+    AlignmentFact, CarriedFact, CondensedFact, Fact, LookalikeFact, PositionFact, RefusalReason, ScaleKind,
+    SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
 };
 use merganser_protocol::wire::limits::{BLOB_PIECE_LEN, PAYLOAD_LEN_MAX};
 use merganser_protocol::wire::{
@@ -130,6 +130,10 @@ impl Forge {
                 } else {
                     Fact::Sighting(SightingFact { stamp, i, j, t_i_j: seen })
                 }
+            }
+            7 if r.one_in(2) => {
+                let i = u32::from(r.byte() % 8);
+                Fact::Lookalike(LookalikeFact { i, j: i + u32::from(r.byte() % 8) })
             }
             _ => {
                 let (kind, len) = (r.byte() % 8, r.below(64));

@@ -3,6 +3,7 @@
 //! crash and a SLAM that begins anew. Where everything looks alike, nothing merges.
 
 use merganser_protocol::agent::Agent;
+use merganser_protocol::agent::io::Event;
 use merganser_sim::report::Report;
 use merganser_sim::scenario::Scenario;
 use merganser_sim::swarm::{Outcome, Swarm};
@@ -78,4 +79,21 @@ fn shelves_that_look_alike_are_not_merged_wrongly() {
         assert!(report.violation.is_none(), "seed {seed}: {:?}", report.violation);
         assert!(report.robots.iter().all(|robot| robot.submaps > 5), "{:?}", report.robots);
     }
+}
+
+/// From within one of many equal cells nobody can tell them apart at first. Who has been in two of them can, and tells all:
+/// whoever it was taken for a neighbour of parts from it.
+#[test]
+fn who_has_seen_its_own_place_repeat_merges_with_nobody_for_long() {
+    let aisles = SHELVES.replace("aliased = true", "aliased = true\naisles = true\nmargin_m = 25.0");
+    // What is wrong for a while is no violation here.
+    let aisles = format!("{aisles}\n[expect]\nerror_max_m = 1000.0\nerror_max_deg = 180.0\n");
+    let mut merged = 0;
+    for seed in [1, 5, 6, 8] {
+        let report = simulate(&aisles, seed).unwrap();
+        assert!(report.violation.is_none(), "seed {seed}: {:?}", report.violation);
+        assert!(report.robots.iter().all(|robot| robot.merged_with.is_empty()), "seed {seed}: {:?}", report.robots);
+        merged += report.told.iter().filter(|told| matches!(told.event, Event::Merged { .. })).count();
+    }
+    assert!(merged > 0, "nothing was at stake");
 }
