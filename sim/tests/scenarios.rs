@@ -16,5 +16,5 @@ fn all_scenarios_are_good() {
         assert!(!scenario.about.is_empty());
         count += 1;
     }
-    assert_eq!(count, 12);
+    assert_eq!(count, 13);
 }
