@@ -3,9 +3,9 @@
 
 use super::Agent;
 use super::io::{Event, JobId};
-use super::job::{AlignJob, Job, Look, Measured};
+use super::job::{AlignJob, Job, Look, Measured, NotAligned};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
-use super::negotiation::{FETCHES_MAX, Fetch, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work, may_repeat};
+use super::negotiation::{FETCHES_MAX, Fetch, LOOKALIKES_MAX, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work};
 use super::promise::Guess;
 use super::ranking::Proposal;
 use super::shortlist::Candidate;
@@ -298,7 +298,7 @@ impl Agent {
         spread.neighbours().nth((turn / 2) % spread.neighbours().count().max(1))
     }
 
-    pub(super) fn on_aligned(&mut self, job: JobId, outcome: Result<Box<Measured>, RefusalReason>) {
+    pub(super) fn on_aligned(&mut self, job: JobId, outcome: Result<Box<Measured>, NotAligned>) {
         let Some(work) = self.negotiation.running.remove(&job) else { return };
         self.negotiation.stir();
         self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
@@ -307,9 +307,9 @@ impl Agent {
                 self.tell_try(&work, guess, outcome.is_ok());
                 match outcome {
                     Ok(measured) => self.propose(&work, &measured),
-                    Err(reason) => {
+                    Err(why) => {
                         self.note_refusal(pair_of(work.mine, work.theirs));
-                        self.note_lookalike(&work, reason);
+                        self.note_lookalike(&work, why);
                     }
                 }
             }
@@ -320,20 +320,24 @@ impl Agent {
                         sigma: measured.sigma as f32,
                         support: to_support(measured.support),
                     },
-                    Err(reason) => VerdictOutcome::Refused(reason),
+                    Err(why) => VerdictOutcome::Refused(why.reason),
                 };
                 self.write_verdict(id, verdict);
             }
         }
     }
 
-    /// Two of our own submaps fit in several ways: all are told so, unless it is plain that our place does not repeat itself.
-    fn note_lookalike(&mut self, work: &Work, reason: RefusalReason) {
-        let (i, j) = pair_of(work.mine, work.theirs);
-        let frame = self.me.frame;
-        let [told, held] = [self.knowledge.lookalikes_of(frame), self.knowledge.loops_of(frame)];
-        let ours = i.frame == frame && j.frame == frame;
-        if ours && reason == RefusalReason::Ambiguous && may_repeat(told, held) {
+    /// Of two of our own submaps, one fits at another place as well: all are told so, once of either, so that no single bare
+    /// submap speaks for a whole frame. Of submaps of another epoch nothing is told.
+    fn note_lookalike(&mut self, work: &Work, why: NotAligned) {
+        let ((i, j), frame) = (pair_of(work.mine, work.theirs), self.me.frame);
+        let is_of_ours = i.frame == frame && j.frame == frame;
+        if !why.elsewhere || !is_of_ours {
+            return;
+        }
+        let told = self.knowledge.lookalikes_of(frame);
+        let is_new = |index: u32| told.iter().all(|(i, j)| *i != index && *j != index);
+        if told.len() < LOOKALIKES_MAX && is_new(i.index) && is_new(j.index) {
             self.write(frame.epoch, &Fact::Lookalike(LookalikeFact { i: i.index, j: j.index }));
         }
     }

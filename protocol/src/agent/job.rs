@@ -9,7 +9,7 @@ use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEsti
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
-use crate::submap::landmarks::{self, LandmarkConfig};
+use crate::submap::landmarks::{self, LandmarkConfig, LandmarkError};
 use crate::submap::planar::FlatConfig;
 use crate::submap::{
     self, Described, Features, Keypoints, RefineConfig, RefineError, RegisterConfig, RegisterError, Registered, Submap,
@@ -85,7 +85,7 @@ pub enum JobResult {
     /// Of [`Job::Describe`].
     Described(Box<(Submap, Described)>),
     /// Of [`Job::Align`].
-    Aligned(Result<Box<Measured>, RefusalReason>),
+    Aligned(Result<Box<Measured>, NotAligned>),
     /// Of [`Job::Solve`].
     Solved(Box<Solved>),
 }
@@ -170,6 +170,21 @@ pub struct Measured {
     pub log10_nfa: f64,
 }
 
+/// Why there is no alignment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NotAligned {
+    /// What the other endpoint is told.
+    pub reason: RefusalReason,
+    /// Another place fits as well: not the same one turned, slid or in a mirror.
+    pub elsewhere: bool,
+}
+
+impl From<RefusalReason> for NotAligned {
+    fn from(reason: RefusalReason) -> Self {
+        Self { reason, elsewhere: false }
+    }
+}
+
 impl Job {
     /// Does the work. Deterministic: the same job gives the same result.
     pub fn run(self) -> JobResult {
@@ -231,13 +246,13 @@ impl SolveJob {
 }
 
 impl AlignJob {
-    fn run(&self) -> Result<Measured, RefusalReason> {
+    fn run(&self) -> Result<Measured, NotAligned> {
         let there = self.one_way(&self.theirs, &self.mine, self.verticals)?;
         let Some((keypoints, features)) = &self.back else { return Ok(there) };
         let back = self.one_way(keypoints, features, self.verticals.map(Verticals::back))?;
         let t_mine_theirs = back.t_mine_theirs.inverse();
         if !two_sided::agree(&there.t_mine_theirs, &t_mine_theirs) {
-            return Err(RefusalReason::Ambiguous);
+            return Err(RefusalReason::Ambiguous.into());
         }
         let t_mine_theirs = two_sided::midway(&there.t_mine_theirs, &t_mine_theirs);
         Ok(Measured {
@@ -255,23 +270,28 @@ impl AlignJob {
         theirs: &Keypoints,
         mine: &Features,
         verticals: Option<Verticals>,
-    ) -> Result<Measured, RefusalReason> {
+    ) -> Result<Measured, NotAligned> {
         match (self.sensor, self.scale) {
             (Sensor::Laser2d, ScaleKind::Metric) => {
                 self.measured(submap::planar::register(theirs, mine, &FlatConfig::default()))
             }
             // In the plane nobody tells a scale.
-            (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput),
+            (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput.into()),
             (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(theirs, mine, true),
-            (Sensor::Landmarks, _) => upright(self.landmarks(theirs, mine, false)?, verticals),
+            (Sensor::Landmarks, _) => Ok(upright(self.landmarks(theirs, mine, false)?, verticals)?),
             (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Metric) => self.register(theirs, mine, verticals),
-            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Unknown) => upright(self.align(theirs, mine)?, verticals),
+            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Unknown) => {
+                Ok(upright(self.align(theirs, mine)?, verticals)?)
+            }
         }
     }
 
-    fn landmarks(&self, theirs: &Keypoints, mine: &Features, planar: bool) -> Result<Measured, RefusalReason> {
+    fn landmarks(&self, theirs: &Keypoints, mine: &Features, planar: bool) -> Result<Measured, NotAligned> {
         let config = LandmarkConfig { planar, solver: self.solver() };
-        let found = landmarks::register(theirs, mine, &config).map_err(|e| RefusalReason::from(&e))?;
+        let found = landmarks::register(theirs, mine, &config).map_err(|e| NotAligned {
+            reason: RefusalReason::from(&e),
+            elsewhere: matches!(e, LandmarkError::Ambiguous { elsewhere: true, .. }),
+        })?;
         let landmarks::Aligned { t_mine_theirs, sigma, support, log10_nfa } = found;
         Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
     }
@@ -281,7 +301,7 @@ impl AlignJob {
         theirs: &Keypoints,
         mine: &Features,
         verticals: Option<Verticals>,
-    ) -> Result<Measured, RefusalReason> {
+    ) -> Result<Measured, NotAligned> {
         let config = RegisterConfig {
             solver: self.solver(),
             fit_min: self.config.fit_min,
@@ -292,20 +312,22 @@ impl AlignJob {
         self.measured(submap::register(theirs, mine, &config))
     }
 
-    fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, RefusalReason> {
+    fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, NotAligned> {
         let found = found.map_err(|error| match error {
-            RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. } => RefusalReason::NoConsensus,
-            RegisterError::Ambiguous { .. } | RegisterError::Lookalike { .. } => RefusalReason::Ambiguous,
-            RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate,
-            RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit,
-            RegisterError::Refine(_) => RefusalReason::NoConsensus,
+            RegisterError::Ambiguous { elsewhere, .. } | RegisterError::Lookalike { elsewhere, .. } => {
+                NotAligned { reason: RefusalReason::Ambiguous, elsewhere }
+            }
+            RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. } => RefusalReason::NoConsensus.into(),
+            RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate.into(),
+            RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit.into(),
+            RegisterError::Refine(_) => RefusalReason::NoConsensus.into(),
             RegisterError::Solver(_)
             | RegisterError::Thinning { .. }
             | RegisterError::Crowded { .. }
-            | RegisterError::NotPlanar => RefusalReason::BadInput,
+            | RegisterError::NotPlanar => RefusalReason::BadInput.into(),
         })?;
         if found.log10_nfa > self.config.log10_nfa_max {
-            return Err(RefusalReason::NoConsensus);
+            return Err(RefusalReason::NoConsensus.into());
         }
         Ok(Measured {
             t_mine_theirs: Relative::Metric(found.refined.pose),

@@ -35,7 +35,7 @@ fn aligned(
         seed: 1,
     };
     let JobResult::Aligned(answer) = Job::Align(Box::new(job)).run() else { panic!("another job's result") };
-    answer.map(|measured| *measured)
+    answer.map(|measured| *measured).map_err(|why| why.reason)
 }
 
 #[test]

@@ -14,7 +14,6 @@ use crate::wire::fact::{
     VerdictFact, VerdictOutcome,
 };
 use core::num::NonZero;
-use core::ops::RangeInclusive;
 use nalgebra::Vector3;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -347,23 +346,15 @@ impl Knowledge {
                 *counts.entry((a, b)).or_default() += 1;
             }
         }
-        let within: BTreeSet<(FrameId, u32, u32)> =
-            self.lookalikes.iter().map(|(id, pair)| (id.frame, pair.i, pair.j)).collect();
-        for (frame, ..) in within {
-            *counts.entry((frame, frame)).or_default() += 1;
-        }
+        let frames: BTreeSet<FrameId> = self.lookalikes.keys().map(|id| id.frame).collect();
+        counts.extend(frames.into_iter().map(|frame| ((frame, frame), self.lookalikes_of(frame).len())));
         counts
     }
 
-    /// How many lookalikes were told of within a frame.
-    pub(super) fn lookalikes_of(&self, frame: FrameId) -> usize {
-        self.lookalikes.range(entries_of(frame)).count()
-    }
-
-    /// How many loop closures were stated within a frame.
-    pub(super) fn loops_of(&self, frame: FrameId) -> usize {
-        let stated = self.alignments.range(entries_of(frame));
-        stated.filter(|(_, fact)| fact.i.frame == frame && fact.j.frame == frame).count()
+    /// Pairs within a frame of which its owner tells that one fits at another place as well.
+    pub(super) fn lookalikes_of(&self, frame: FrameId) -> BTreeSet<(u32, u32)> {
+        let told = self.lookalikes.range(EntryId { frame, seq: 0 }..=EntryId { frame, seq: u32::MAX });
+        told.map(|(_, pair)| (pair.i, pair.j)).collect()
     }
 
     /// Of all alignments of two submaps the one that counts: the first that both endpoints agree on.
@@ -395,11 +386,6 @@ impl Knowledge {
         }
         chains.into_iter().filter(|(_, (chain, _))| !chain.is_empty()).map(|(f, (chain, _))| (f, chain)).collect()
     }
-}
-
-/// Places of all entries of a frame.
-fn entries_of(frame: FrameId) -> RangeInclusive<EntryId> {
-    EntryId { frame, seq: 0 }..=EntryId { frame, seq: u32::MAX }
 }
 
 /// Whether the observer says where another robot is, and nobody else does.

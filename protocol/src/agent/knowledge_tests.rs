@@ -137,9 +137,10 @@ fn who_takes_its_own_places_for_others_tells_of_its_frame_alone() {
     let mut known = knowledge(&told);
     let counts = BTreeMap::from([((frame(1), frame(1)), 2), ((frame(2), frame(2)), 1)]);
     assert_eq!(problem(&known).ambiguous, counts, "twice told is told once");
-    assert_eq!((known.lookalikes_of(frame(1)), known.lookalikes_of(frame(3))), (3, 0));
+    let of = |known: &Knowledge, robot| known.lookalikes_of(frame(robot)).len();
+    assert_eq!((of(&known, 1), of(&known, 3)), (2, 0));
     known.forget_below(frame(1), 2);
-    assert_eq!(known.lookalikes_of(frame(1)), 2);
+    assert_eq!(of(&known, 1), 2);
     let carried = [(1, 0, 7), (2, 0, 8)].map(|(seq, i, j)| CarriedFact {
         seq,
         after: None,

@@ -19,7 +19,7 @@ pub const REFUSED_MAX: usize = 32_768;
 pub const REFUSED_WAITING_MAX: usize = 16;
 
 /// To be raised when pairs that were refused may be aligned by a later version.
-const ALIGNER: u32 = 1;
+const ALIGNER: u32 = 2;
 
 /// See the module.
 pub(super) struct Refusals {

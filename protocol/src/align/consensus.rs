@@ -6,7 +6,9 @@ use super::covariance::{self, Estimate};
 use super::prepare::{self, Matches};
 use super::refine::{self, Context, Fit};
 use super::sample::{Candidate, Sampler, Step};
+use super::solve::Motion;
 use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig, Standing};
+use nalgebra::Vector3;
 
 /// Prefixes of the matches searched: rigid, with scale. The costlier the search, the finer the steps; the largest bounds
 /// time and memory, which grow with its square and worse.
@@ -129,13 +131,22 @@ impl<'a> Search<'a> {
         if let Some(rival) = self.rival(&best, stage) {
             let (a, b) = (best.support, rival.support);
             if a.min(b) >= self.config.rival_ratio * a.max(b) {
-                return Err(Refusal::Ambiguous { support: a.max(b), rival_support: a.min(b) });
+                let apart = self.apart(&best.fit.motion, &rival.fit.motion);
+                return Err(Refusal::Ambiguous { support: a.max(b), rival_support: a.min(b), apart });
             }
             if b > a {
                 best = rival;
             }
         }
         self.conclude(best)
+    }
+
+    /// How far from one another two motions put the middle of the sources, which are counted from there, in units of their
+    /// root mean square distance from it.
+    fn apart(&self, a: &Motion, b: &Motion) -> f64 {
+        let source = &self.context.matches.source;
+        let mean = source.iter().map(Vector3::norm_squared).sum::<f64>() / source.len().max(1) as f64;
+        (a.translation - b.translation).norm() / (a.scale * mean.sqrt()).max(f64::MIN_POSITIVE)
     }
 
     /// Searches growing prefixes and σ levels until a fit is accepted; else the best provisional one of all.

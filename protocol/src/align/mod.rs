@@ -206,6 +206,8 @@ pub enum Refusal {
         support: f64,
         /// Of its rival.
         rival_support: f64,
+        /// How far from one another the two put the middle of the sources, in units of the sources' spread about it.
+        apart: f64,
     },
     /// The inliers leave a rotation undetermined: a line or one cluster.
     #[error("rotation known to {rotation_sigma:.2} rad only: inliers on a line or in one cluster")]

@@ -25,8 +25,8 @@ const WEIGHED_MAX: usize = 32;
 /// every shelf is the same, false merges had 1 to 2.3; elsewhere LiDARs have up to 0.2 and landmarks up to 0.7.
 const AMBIGUOUS_SHARE: f64 = 0.8;
 
-/// Loop closures of one frame that its odometry refutes, or that fit in several ways, from which on they tell of a place that
-/// repeats itself: one may be chance.
+/// Loop closures of one frame that its odometry refutes, or that fit at another place as well, from which on they tell of a place
+/// that repeats itself: fewer may be chance.
 const REPEATED_MIN: usize = 2;
 
 /// A pair of frames, `a < b`, and what its own alignments say.

@@ -36,6 +36,10 @@ const ROTATION_SIGMA_MAX: f64 = 0.25;
 /// Share of keypoints that may lie in one half-voxel cell with another: of a thinned cloud's hardly any do.
 const CROWDED_MAX: f64 = 0.1;
 
+/// A rival that puts the middle of their keypoints so far from where the best pose does, voxels, sees another place; nearer, the
+/// same place turned about, or slid along.
+const ELSEWHERE: f64 = 16.0;
+
 /// When an alignment is refused.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegisterConfig {
@@ -120,6 +124,8 @@ pub enum RegisterError {
         score: f64,
         /// Of the other.
         rival: f64,
+        /// The other one sees another place, not the same one otherwise.
+        elsewhere: bool,
     },
     /// Nothing speaks against another pose that is far from the best one.
     #[error(
@@ -131,6 +137,8 @@ pub enum RegisterError {
         support: usize,
         /// Of those with what lies elsewhere, those that agree with the other.
         rival: usize,
+        /// The other one sees another place, not the same one otherwise.
+        elsewhere: bool,
     },
     /// The two clouds were thinned so differently that they show different things.
     #[error("their cloud is thinned to {ratio:.3} times my voxel; set submap.voxel_m alike on all robots")]
@@ -199,14 +207,15 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     // A rival need not pass itself: it is enough that it is credible.
     let credible = |j: &&Judged| j.fit >= config.fit_min && j.contradiction() <= 2.0 * config.contradiction_max;
     let rival = judged.iter().filter(credible).find(|j| court.rivals(&best.pose, &j.pose));
-    let rival = rival.map_or(0.0, |rival| rival.score);
-    let ambiguous = RegisterError::Ambiguous { score: best.score, rival };
-    if rival >= config.rival_ratio * best.score {
-        return Err(ambiguous);
+    let is_elsewhere = |rival: &Judged| court.differ(&rival.pose, &best.pose, ELSEWHERE, f64::INFINITY);
+    if let Some(rival) = rival.filter(|rival| rival.score >= config.rival_ratio * best.score) {
+        let elsewhere = is_elsewhere(rival);
+        return Err(RegisterError::Ambiguous { score: best.score, rival: rival.score, elsewhere });
     }
     let clouds = (&their_cloud, &my_cloud);
     if let Some(rival) = lookalike::rival(&pairings, (mine, &my_points), clouds, &court, best, &upright) {
-        return Err(RegisterError::Lookalike { support: best.support.len(), rival: rival.support.len() });
+        let elsewhere = is_elsewhere(&rival);
+        return Err(RegisterError::Lookalike { support: best.support.len(), rival: rival.support.len(), elsewhere });
     }
     let anchors = best
         .support
@@ -227,7 +236,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     if refined.share < config.refine.share_min {
         let slid = court.slid(best);
         if slid > config.slid_max * best.surface {
-            return Err(RegisterError::Ambiguous { score: best.surface, rival: slid });
+            return Err(RegisterError::Ambiguous { score: best.surface, rival: slid, elsewhere: false });
         }
     }
     Ok(Registered {

@@ -116,10 +116,12 @@ mod tests {
         assert!(payload(vec![carried(3, Some(7), submap())]).is_err(), "never after itself");
         assert!(payload(vec![carried(3, None, nested)]).is_err());
         let many = |n: u32| payload((0..n).map(|seq| carried(seq, None, verdict())).collect());
-        assert!(
-            matches!(many(CARRIED_MAX as u32), Err(FactError::TooLong(_))),
-            "full of the smallest facts it is long"
-        );
+        assert!(matches!(many(CARRIED_MAX as u32), Err(FactError::TooLong(_))), "full of verdicts it is long");
+        let alike = |n: u32| {
+            let fact = Fact::Lookalike(crate::wire::fact::LookalikeFact { i: 1, j: 9 });
+            payload((0..n).map(|seq| carried(seq, None, fact.clone())).collect())
+        };
+        assert!(alike(CARRIED_MAX as u32).is_ok() && alike(CARRIED_MAX as u32 + 1).is_err());
         assert!(matches!(many(CARRIED_MAX as u32 + 1), Err(FactError::Value { .. })));
         // Bytes that claim a nested one, or places that wrap.
         let raw = |step, kind| RawCarried { step, kind, after: None, payload: verdict().to_payload().unwrap() };

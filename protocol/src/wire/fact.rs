@@ -155,8 +155,9 @@ pub struct PositionFact {
     pub covariance: Covariance<3>,
 }
 
-/// Two submaps of the frame that the entry is of, which its owner looked at for a loop and which fit in several ways
-/// ([`RefusalReason::Ambiguous`]): a frame that has many of them repeats itself.
+/// Two submaps of the frame that the entry is of, which its owner looked at for a loop, and of which one fits at two places of
+/// the other ([`RefusalReason::Ambiguous`], but for what only could be turned, slid or mirrored where it is): a frame that has
+/// many of them repeats itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LookalikeFact {
     /// Index of the earlier one.

@@ -1,6 +1,7 @@
 //! A tiny shell for tests: agents joined by perfect wires, jobs run inline, a world of random boxes.
 
 use merganser_protocol::agent::io::{Channel, Event, Input, Output, QueryKind, Record};
+use merganser_protocol::agent::job::{Job, JobResult, NotAligned};
 use merganser_protocol::agent::{Agent, Identity, Restored};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
@@ -140,6 +141,8 @@ pub struct Wires {
     pub published: Vec<(usize, Channel, Vec<u8>)>,
     /// Who asked for a piece of a blob, when, and the answer.
     pub pieces: Vec<(usize, Instant, Option<Vec<u8>>)>,
+    /// What every look at a loop of somebody's own comes to, if it is not to be run.
+    pub loops_end: Option<NotAligned>,
     inbox: VecDeque<(usize, Input)>,
 }
 
@@ -154,6 +157,7 @@ impl Wires {
             batches: Vec::new(),
             published: Vec::new(),
             pieces: Vec::new(),
+            loops_end: None,
             inbox: VecDeque::new(),
         };
         for a in 0..wires.agents.len() {
@@ -233,7 +237,14 @@ impl Wires {
                 self.inbox.push_back((k, Input::Answered { query, bytes: answer }));
             }
             Output::Answer { .. } => {}
-            Output::Run { id, job } => self.inbox.push_back((k, Input::JobDone { job: id, result: job.run() })),
+            Output::Run { id, job } => {
+                let is_loop = matches!(&job, Job::Align(job) if job.back.is_some());
+                let result = match self.loops_end.filter(|_| is_loop) {
+                    Some(why) => JobResult::Aligned(Err(why)),
+                    None => job.run(),
+                };
+                self.inbox.push_back((k, Input::JobDone { job: id, result }));
+            }
             Output::Event(event) => self.events.push((k, event)),
         }
     }

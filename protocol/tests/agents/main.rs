@@ -15,6 +15,7 @@ mod contract;
 mod epochs;
 mod front_ends;
 mod link_budget;
+mod lookalikes;
 mod restarts;
 mod sightings;
 mod third_parties;

@@ -13,8 +13,8 @@ use merganser_protocol::wire::limits::{
 };
 use merganser_protocol::wire::{Delta, Entry, HaveVector, Message, SwarmTag};
 
-/// Fact kinds 1 to 5 and one on either side.
-const KINDS: core::ops::RangeInclusive<u8> = 0..=6;
+/// Fact kinds 1 to 7 and one on either side.
+const KINDS: core::ops::RangeInclusive<u8> = 0..=8;
 
 /// Panics if a decoder does anything but refuse or give back what it was given.
 pub fn decode(bytes: &[u8], meter: &impl Meter) {

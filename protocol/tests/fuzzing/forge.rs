@@ -114,7 +114,9 @@ impl Forge {
             6 if r.one_in(2) => {
                 let carried = (0..r.below(4) as u32).map(|seq| {
                     let after = if r.one_in(2) { Some(u32::from(r.byte() % 4)) } else { None };
-                    CarriedFact { seq, after, fact: Fact::Submap(submap_fact(r)) }
+                    let alike = Fact::Lookalike(LookalikeFact { i: seq, j: seq + 5 });
+                    let fact = if after.is_none() && r.one_in(4) { alike } else { Fact::Submap(submap_fact(r)) };
+                    CarriedFact { seq, after, fact }
                 });
                 Fact::Condensed(CondensedFact { carried: carried.collect() })
             }
@@ -136,7 +138,7 @@ impl Forge {
                 Fact::Lookalike(LookalikeFact { i, j: i + u32::from(r.byte() % 8) })
             }
             _ => {
-                let (kind, len) = (r.byte() % 8, r.below(64));
+                let (kind, len) = (r.byte() % 9, r.below(64));
                 return (kind, r.bytes(len).to_vec());
             }
         };

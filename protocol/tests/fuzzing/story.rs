@@ -10,7 +10,7 @@ use super::reader::Reader;
 use merganser_protocol::agent::io::{
     AskToken, Channel, Command, Input, JobId, PositionSighting, QueryId, QueryKind, Record, Sighting,
 };
-use merganser_protocol::agent::job::{JobResult, Measured};
+use merganser_protocol::agent::job::{JobResult, Measured, NotAligned};
 use merganser_protocol::agent::{Agent, Restored};
 use merganser_protocol::ids::RobotId;
 use merganser_protocol::submap::place::Metric;
@@ -265,7 +265,10 @@ impl<'m, M: Meter> Story<'m, M> {
                 let Some((_, old)) = r.choose(&self.results).cloned() else { return };
                 (job.map_or(JobId(r.u64()), |(id, _)| id), old)
             }
-            (216..=235, job) => (job.map_or(JobId(1), |(id, _)| id), JobResult::Aligned(Err(RefusalReason::TooFew))),
+            (216..=235, job) => {
+                let why = NotAligned { reason: RefusalReason::Ambiguous, elsewhere: r.one_in(2) };
+                (job.map_or(JobId(1), |(id, _)| id), JobResult::Aligned(Err(why)))
+            }
             (236.., job) => {
                 let [sigma, support, log10_nfa] = r.numbers();
                 let measured = Measured { t_mine_theirs: forge::relative(r), sigma, support, log10_nfa };

@@ -3,7 +3,7 @@
 
 use crate::dice::Dice;
 use crate::scenario::SummaryOptions;
-use merganser_protocol::agent::job::{AlignJob, Job, JobResult, Measured, SolveJob};
+use merganser_protocol::agent::job::{AlignJob, Job, JobResult, Measured, NotAligned, SolveJob};
 use merganser_protocol::estimate::joint::MapProblem;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
 use merganser_protocol::ids::Hash;
@@ -52,7 +52,7 @@ impl StandIn {
             }
             Job::Align(job) => {
                 let lies = self.options.liars.iter().any(|liar| liar == name);
-                (JobResult::Aligned(self.align(name, lies, &job).map(Box::new)), lies)
+                (JobResult::Aligned(self.align(name, lies, &job).map(Box::new).map_err(NotAligned::from)), lies)
             }
             Job::Solve(job) if !self.options.solve => {
                 let nothing = SolveJob { problem: MapProblem::default(), ..*job };
@@ -167,7 +167,7 @@ mod tests {
             seed,
         };
         match standin.run("alpha", Job::Align(Box::new(job)), |_| None).0 {
-            JobResult::Aligned(answer) => answer,
+            JobResult::Aligned(answer) => answer.map_err(|why| why.reason),
             other => panic!("{other:?}"),
         }
     }

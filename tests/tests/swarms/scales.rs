@@ -88,12 +88,16 @@ fn who_has_seen_its_own_place_repeat_merges_with_nobody_for_long() {
     let aisles = SHELVES.replace("aliased = true", "aliased = true\naisles = true\nmargin_m = 25.0");
     // What is wrong for a while is no violation here.
     let aisles = format!("{aisles}\n[expect]\nerror_max_m = 1000.0\nerror_max_deg = 180.0\n");
-    let mut merged = 0;
-    for seed in [1, 5, 6, 8] {
+    // Of the first eight, those that merge at all; before robots told, three of them stayed merged to the end.
+    for seed in [1, 4, 5, 6, 8] {
         let report = simulate(&aisles, seed).unwrap();
         assert!(report.violation.is_none(), "seed {seed}: {:?}", report.violation);
         assert!(report.robots.iter().all(|robot| robot.merged_with.is_empty()), "seed {seed}: {:?}", report.robots);
-        merged += report.told.iter().filter(|told| matches!(told.event, Event::Merged { .. })).count();
+        let when = |is_one: fn(&Event) -> bool| {
+            report.told.iter().filter(move |told| is_one(&told.event)).map(|told| told.at_secs)
+        };
+        let first = when(|event| matches!(event, Event::Merged { .. })).next().expect("nothing was at stake");
+        let last = when(|event| matches!(event, Event::Unmerged { .. })).next_back().unwrap();
+        assert!(last - first < 10.0, "seed {seed}: wrong from {first} s to {last} s");
     }
-    assert!(merged > 0, "nothing was at stake");
 }

@@ -117,7 +117,7 @@ fn refusals_have_wire_reasons() {
     let reasons = [
         (Refusal::TooFew { distinct: 0, needed: 6 }, RefusalReason::TooFew),
         (Refusal::NoConsensus { log10_nfa: 0.0, support: 0.0 }, RefusalReason::NoConsensus),
-        (Refusal::Ambiguous { support: 9.0, rival_support: 8.0 }, RefusalReason::Ambiguous),
+        (Refusal::Ambiguous { support: 9.0, rival_support: 8.0, apart: 1.0 }, RefusalReason::Ambiguous),
         (Refusal::Degenerate { rotation_sigma: 1.0 }, RefusalReason::Degenerate),
     ];
     for (refusal, reason) in reasons {

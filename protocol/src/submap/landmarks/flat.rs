@@ -97,7 +97,7 @@ pub fn agree(matches: &[Match], area: f64, rival_ratio: f64, rotation_sigma_max:
     };
     let rival = fits.iter().filter(different).filter(apart).map(|fit| fit.members.len()).max().unwrap_or(0);
     if rival as f64 >= rival_ratio * members as f64 && rival >= MATCHES_MIN - 1 {
-        return Err(LandmarkError::Ambiguous { members, rival });
+        return Err(LandmarkError::Ambiguous { members, rival, elsewhere: false });
     }
     let covariance = best.information.try_inverse().unwrap_or(Matrix3::from_diagonal_element(f64::INFINITY));
     let rotation_sigma = covariance[(2, 2)].sqrt();

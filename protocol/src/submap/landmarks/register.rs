@@ -21,6 +21,9 @@ const LOOK_ALIKES_MAX: usize = 4;
 /// A second pose with this share of the support of the first makes the answer ambiguous: descriptors do not agree on a pose
 /// by chance, so it tells that the place repeats itself, and which repetition is seen is then anyone's guess.
 const RIVAL_RATIO_IN_SPACE: f64 = 0.1;
+/// A rival that puts the middle of theirs so far from where the first pose does, in units of their spread, sees another place;
+/// nearer, the same place turned.
+const ELSEWHERE: f64 = 0.5;
 /// Landmarks that lie in a plane to within so many times their noise look the same in a mirror.
 const FLAT_SIGMAS: f64 = 3.0;
 /// The noise scale may exceed the stated one by this factor.
@@ -97,6 +100,8 @@ pub enum LandmarkError {
         members: usize,
         /// Of the other.
         rival: usize,
+        /// The other one sees another place, not the same one otherwise.
+        elsewhere: bool,
     },
     /// All landmarks that agree lie in one plane: a mirror image would look the same.
     #[error("the landmarks lie {thickness:.3} off one plane, with noise of {sigma:.3}: a mirror image looks the same")]
@@ -136,8 +141,9 @@ impl From<Refusal> for LandmarkError {
         match refusal {
             Refusal::TooFew { distinct, needed } => Self::TooFew { matches: distinct, needed },
             Refusal::NoConsensus { log10_nfa, support } => Self::NoConsensus { members: support as usize, log10_nfa },
-            Refusal::Ambiguous { support, rival_support } => {
-                Self::Ambiguous { members: support as usize, rival: rival_support as usize }
+            Refusal::Ambiguous { support, rival_support, apart } => {
+                let elsewhere = apart >= ELSEWHERE;
+                Self::Ambiguous { members: support as usize, rival: rival_support as usize, elsewhere }
             }
             Refusal::Degenerate { rotation_sigma } => Self::Degenerate { rotation_sigma },
         }

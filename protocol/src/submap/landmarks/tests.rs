@@ -4,6 +4,7 @@ use super::super::{Features, Keypoints};
 use super::{Aligned, Chart, Constellation, Descriptor, Landmark, LandmarkConfig, LandmarkError, Mark, register};
 use crate::align::{Model, SolverConfig};
 use crate::geometry::{Covariance, Relative, Sim3, So3};
+use crate::wire::fact::RefusalReason;
 use nalgebra::{Matrix3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -230,7 +231,7 @@ fn what_repeats_itself_is_ambiguous_and_a_few_look_alikes_are_not() {
         let strewn = [0, 1].map(|k| look(frames[k]).at(&mut dice, &things, 0..60));
         for config in [any_scale(), in_space(Model::Rigid)] {
             let answer = register(&offered(&theirs, 0.1), &kept(&both, 0.1), &config);
-            assert!(matches!(answer, Err(LandmarkError::Ambiguous { .. })), "{trial}: {answer:?}");
+            assert!(matches!(answer, Err(LandmarkError::Ambiguous { elsewhere: true, .. })), "{trial}: {answer:?}");
             assert!(register(&offered(&theirs, 0.1), &kept(&alone, 0.1), &config).is_ok(), "{trial}");
             let [mine, theirs] = &strewn;
             let answer = register(&offered(theirs, 0.1), &kept(mine, 0.1), &config).unwrap();
@@ -288,6 +289,7 @@ fn poor_constellations_are_refused() {
     let (mine, theirs) = both(&mut dice, &things, 20);
     let plane = answer(&mine, &theirs, &in_space(Model::Rigid));
     assert!(matches!(plane, Err(LandmarkError::Mirror { .. })), "{plane:?}");
+    assert_eq!(RefusalReason::from(&plane.unwrap_err()), RefusalReason::Degenerate, "of other places it says nothing");
     assert_eq!(answer(&mine, &theirs, &planar()), Err(LandmarkError::NotPlanar));
 
     // In the plane: three could agree by accident, four are enough; a mirrored world is another one.
@@ -306,7 +308,7 @@ fn poor_constellations_are_refused() {
     let mut moved = flat.clone();
     moved.iter_mut().take(10).for_each(|l| l.at.x += 3.0);
     let two = answer(&flat, &moved, &config);
-    assert!(matches!(two, Err(LandmarkError::Ambiguous { members: 10, rival: 10 })), "{two:?}");
+    assert!(matches!(two, Err(LandmarkError::Ambiguous { members: 10, rival: 10, elsewhere: false })), "{two:?}");
 }
 
 #[test]

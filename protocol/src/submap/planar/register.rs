@@ -93,7 +93,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &FlatConfig) -> Res
     let rival = judged.iter().filter(credible).find(|j| court.rivals(&best.pose, &j.pose));
     let rival = rival.map_or(0.0, |rival| rival.score);
     if rival >= config.rival_ratio * best.score {
-        return Err(RegisterError::Ambiguous { score: best.score, rival });
+        return Err(RegisterError::Ambiguous { score: best.score, rival, elsewhere: false });
     }
     let refined = refined(&court, &best.pose, voxel)?;
     Ok(Registered {
