@@ -87,7 +87,8 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
 
 /// Frames in which about as many places look like others, as was told (`ambiguous`) or as their odometry tells, as were seen
 /// again: what looks the same there is not. *Measured* in simulated halls, drives of 20 to 120 s: of the loops looked at 75 to
-/// 100 % where every shelf or room is the same; 0 of 418 elsewhere, and up to 3 of 57 in rows of cells that are not quite alike.
+/// 100 % where every shelf or room is the same; 0 of 418 in others,
+/// up to 3 of 57 in cells that are not quite alike, and a fifth along streets, where all merge.
 fn repeating(loops: &BTreeMap<FrameId, Loops>, ambiguous: &BTreeMap<(FrameId, FrameId), usize>) -> BTreeSet<FrameId> {
     let repeats = |frame: &FrameId| {
         let Loops { held, refuted } = loops.get(frame).copied().unwrap_or_default();
