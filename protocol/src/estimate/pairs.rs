@@ -86,9 +86,9 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
 }
 
 /// Frames in which about as many places look like others, as was told (`ambiguous`) or as their odometry tells, as were seen
-/// again: what looks the same there is not. *Measured* in simulated halls, drives of 20 to 120 s: of the loops looked at 75 to
-/// 100 % where every shelf or room is the same; 0 of 418 in others,
-/// up to 3 of 57 in cells that are not quite alike, and a fifth along streets, where all merge.
+/// again: what looks the same there is not. *Measured*, simulated LiDARs: of the loops that were looked at, ambiguous or refuted
+/// 19 of 19 in rows of equal rooms and 16 of 18 in rows of equal shelves (a seed each); ambiguous 0 of 418 in a furnished hall,
+/// 0 to 3 of 50 to 60 in halls of cells that are not quite alike, and a fifth along streets, where all merge.
 fn repeating(loops: &BTreeMap<FrameId, Loops>, ambiguous: &BTreeMap<(FrameId, FrameId), usize>) -> BTreeSet<FrameId> {
     let repeats = |frame: &FrameId| {
         let Loops { held, refuted } = loops.get(frame).copied().unwrap_or_default();
