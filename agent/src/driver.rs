@@ -348,6 +348,7 @@ fn tell(event: &Event) {
         Event::SubmapFinished { submap, keypoints } => info!(%submap, keypoints, "submap finished"),
         Event::AlignmentAgreed { i, j } => info!(%i, %j, "alignment agreed"),
         Event::AlignmentDisputed { i, j } => warn!(%i, %j, "alignment disputed"),
+        Event::LookedAgain { i, j, found } => debug!(%i, %j, found, "looked again with further keypoints"),
         Event::AlignmentTried { i, j, expected, found } => debug!(%i, %j, expected, found, "alignment tried"),
         Event::AlignmentProposed { i, j, support } => debug!(%i, %j, support, "alignment proposed"),
     }

@@ -51,8 +51,10 @@ pub struct SubmapConfig {
     pub sigma_max_deg: f64,
     /// Points kept per submap after thinning (memory bound).
     pub points_max: usize,
-    /// Keypoints offered to others, 21 bytes each: 332 is 7.0 kB.
+    /// Keypoints offered to others at first, 21 bytes each: 330, and the address of the further ones, are 7.0 kB.
     pub keypoints: usize,
+    /// Further ones, for a second look at a pair that was refused where the joint estimate says that it overlaps. None with 0.
+    pub keypoints_further: usize,
     /// Whether frame units are metres.
     pub scale: crate::wire::fact::ScaleKind,
     /// Odometry standard deviation assumed across a gap in the keyframes, per metre travelled.
@@ -82,7 +84,8 @@ impl Default for SubmapConfig {
             sigma_max_m: 2.0,
             sigma_max_deg: 30.0,
             points_max: 20_000,
-            keypoints: 332,
+            keypoints: 330,
+            keypoints_further: 330,
             scale: crate::wire::fact::ScaleKind::Metric,
             gap_sigma_per_m: 0.1,
             speed_max_m_s: 50.0,
@@ -290,6 +293,7 @@ impl Config {
         range("submap.sigma_max_deg", s.sigma_max_deg, 0.01, 1e6, "use at least 0.01 degrees")?;
         range("submap.points_max", s.points_max as f64, 100.0, 1e6, "use 100 to 1000000 points")?;
         range("submap.keypoints", s.keypoints as f64, 16.0, 1024.0, "use 16 to 1024 keypoints")?;
+        range("submap.keypoints_further", s.keypoints_further as f64, 0.0, 1024.0, "use 0 (none) to 1024 keypoints")?;
         range("submap.gap_sigma_per_m", s.gap_sigma_per_m, 1e-4, 10.0, "use 0.0001 to 10")?;
         range("submap.speed_max_m_s", s.speed_max_m_s, 0.01, 1e4, "use 0.01 to 10000 m/s")?;
         range("submap.turn_max_deg_s", s.turn_max_deg_s, 1.0, 1e6, "use at least 1 degree per second")?;

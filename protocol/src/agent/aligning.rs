@@ -121,24 +121,21 @@ impl Agent {
                 continue;
             };
             let (mine, theirs) = if fact.i.frame.robot == self.me.robot { (fact.i, fact.j) } else { (fact.j, fact.i) };
-            if !self.blobs_match(&fact) || self.negotiation.features(mine).is_none() {
+            let further = self.is_second_look(&fact, mine, theirs);
+            let Some(further) = further.filter(|_| self.negotiation.features(mine).is_some()) else {
                 self.negotiation.verify.remove(&id);
                 self.write_verdict(id, VerdictOutcome::Refused(RefusalReason::BadInput));
-            } else if self.has_room() && self.start_alignment(mine, theirs, Purpose::Verify(id)) {
+                continue;
+            };
+            if self.has_room() && self.start_alignment(mine, theirs, Purpose::Verify(id), further) {
                 self.negotiation.verify.remove(&id);
             }
         }
     }
 
-    /// The alignment names the very blobs that the two submaps' owners stated.
-    fn blobs_match(&self, fact: &AlignmentFact) -> bool {
-        let blob = |id| self.knowledge.submap(id).map(|submap| submap.blob);
-        blob(fact.i) == Some(fact.blobs[0]) && blob(fact.j) == Some(fact.blobs[1])
-    }
-
     fn start_proposing(&mut self, active: &[Proposal]) {
         self.negotiation.begun.retain(|begun| active.iter().any(|p| pair_of(p.mine, p.theirs) == *begun));
-        for &Proposal { mine, theirs, may_wait, bytes, guess } in active {
+        for &Proposal { mine, theirs, may_wait, bytes, guess, further } in active {
             if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
                 break;
             }
@@ -156,7 +153,7 @@ impl Agent {
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
             let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);
             let lacks = ours.any(|id| self.negotiation.features(id).is_none());
-            if lacks || self.start_alignment(mine, theirs, Purpose::Propose(guess)) {
+            if lacks || self.start_alignment(mine, theirs, Purpose::Propose(guess), further) {
                 self.negotiation.mark_tried(pair);
             }
         }
@@ -178,10 +175,10 @@ impl Agent {
     }
 
     /// Starts aligning a pair, if the keypoints it takes are here; otherwise has them fetched.
-    fn start_alignment(&mut self, mine: SubmapId, theirs: SubmapId, purpose: Purpose) -> bool {
-        let Some(keypoints) = self.keypoints_of(theirs) else { return false };
+    fn start_alignment(&mut self, mine: SubmapId, theirs: SubmapId, purpose: Purpose, further: bool) -> bool {
+        let Some(keypoints) = self.keypoints_of(theirs, further) else { return false };
         let Some(features) = self.negotiation.features(mine).cloned() else { return false };
-        let back = self.is_loop(mine, theirs).then(|| self.looking_back(mine, theirs));
+        let back = self.is_loop(mine, theirs).then(|| self.looking_back(mine, theirs, further));
         if back.as_ref().is_some_and(Option::is_none) {
             return false;
         }
@@ -201,7 +198,7 @@ impl Agent {
             seed: self.pair_seed(pair_of(mine, theirs)),
         };
         let id = self.run_job(Job::Align(Box::new(job)));
-        self.negotiation.running.insert(id, Work { mine, theirs, purpose });
+        self.negotiation.running.insert(id, Work { mine, theirs, purpose, further });
         true
     }
 
@@ -217,13 +214,13 @@ impl Agent {
     }
 
     /// What it takes to look at a loop from its other end as well.
-    fn looking_back(&mut self, mine: SubmapId, theirs: SubmapId) -> Option<Look> {
+    fn looking_back(&mut self, mine: SubmapId, theirs: SubmapId, further: bool) -> Option<Look> {
         let features = self.negotiation.features(theirs).cloned()?;
-        Some((self.keypoints_of(mine)?, features))
+        Some((self.keypoints_of(mine, further)?, features))
     }
 
-    fn keypoints_of(&mut self, submap: SubmapId) -> Option<Arc<Keypoints>> {
-        let blob = self.knowledge.submap(submap)?.blob;
+    /// What a blob of this submap says, if it is here; otherwise it is fetched.
+    pub(super) fn keypoints_at(&mut self, blob: Hash, submap: SubmapId) -> Option<Arc<Keypoints>> {
         if let Some(keypoints) = self.negotiation.keypoints(blob) {
             return Some(keypoints.clone());
         }
@@ -251,13 +248,14 @@ impl Agent {
 
     /// Stops fetching what no pair needs any more: of those that were active, the ones that have not begun.
     fn drop_idle_fetches(&mut self, active: &[Proposal]) {
-        let waits = |c: &&Proposal| !self.negotiation.is_tried(pair_of(c.mine, c.theirs));
+        let waits = |c: &&Proposal| c.further || !self.negotiation.is_tried(pair_of(c.mine, c.theirs));
         let mut wanted: BTreeSet<SubmapId> = active.iter().filter(waits).flat_map(|c| [c.mine, c.theirs]).collect();
         for id in self.answers_owed() {
             wanted.extend(self.knowledge.alignment(id).into_iter().flat_map(|fact| [fact.i, fact.j]));
         }
+        let first = |id| self.knowledge.submap(id).map(|fact| fact.blob);
         let blobs: BTreeSet<Hash> =
-            wanted.into_iter().filter_map(|id| self.knowledge.submap(id)).map(|fact| fact.blob).collect();
+            wanted.into_iter().flat_map(|id| [first(id), self.address_of(id)]).flatten().collect();
         self.negotiation.fetches.retain(|hash, fetch| fetch.query.is_some() || blobs.contains(hash));
     }
 
@@ -300,6 +298,12 @@ impl Agent {
 
     pub(super) fn on_aligned(&mut self, job: JobId, outcome: Result<Box<Measured>, NotAligned>) {
         let Some(work) = self.negotiation.running.remove(&job) else { return };
+        let outcome = match outcome {
+            Ok(measured) if work.further && !self.agrees_with_map(&work, &measured.t_mine_theirs) => {
+                Err(RefusalReason::NoConsensus.into())
+            }
+            outcome => outcome,
+        };
         self.negotiation.stir();
         self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
         match work.purpose {
@@ -309,6 +313,7 @@ impl Agent {
                     Ok(measured) => self.propose(&work, &measured),
                     Err(why) => {
                         self.note_refusal(pair_of(work.mine, work.theirs));
+                        self.note_second_look(&work, guess, why.reason);
                         self.note_lookalike(&work, why);
                     }
                 }
@@ -343,15 +348,18 @@ impl Agent {
     }
 
     fn tell_try(&mut self, work: &Work, guess: Guess, found: bool) {
-        self.negotiation.promise.learn(&guess.signs, found);
         let (i, j) = pair_of(work.mine, work.theirs);
+        if work.further {
+            self.stats.worked(if found { "second_look_aligned" } else { "second_look_refused" });
+            return self.event(Event::LookedAgain { i, j, found });
+        }
+        self.negotiation.promise.learn(&guess.signs, found);
         self.event(Event::AlignmentTried { i, j, expected: guess.probability, found });
     }
 
     fn propose(&mut self, work: &Work, measured: &Measured) {
         let (i, j) = pair_of(work.mine, work.theirs);
-        let blob = |id| self.knowledge.submap(id).map(|fact| fact.blob);
-        let (Some(blob_i), Some(blob_j)) = (blob(i), blob(j)) else { return };
+        let Some(blobs) = self.blobs_used(work) else { return };
         self.event(Event::AlignmentProposed { i, j, support: measured.support });
         let fact = Fact::Alignment(AlignmentFact {
             i,
@@ -360,7 +368,7 @@ impl Agent {
             sigma: measured.sigma as f32,
             support: to_support(measured.support),
             log10_nfa: measured.log10_nfa as f32,
-            blobs: [blob_i, blob_j],
+            blobs,
         });
         self.write(self.me.frame.epoch, &fact);
     }
@@ -416,7 +424,7 @@ impl Looks<'_> {
                 if !self.may_pair(mine, theirs) || negotiation.is_tried(pair) {
                     continue;
                 }
-                let candidate = Candidate { mine, theirs, similarity, wished: false };
+                let candidate = Candidate { mine, theirs, similarity, wished: false, further: false };
                 if Negotiation::responsible(pair) == self.me || mine.frame.robot == theirs.frame.robot {
                     negotiation.add_candidate(candidate, limit);
                 } else {

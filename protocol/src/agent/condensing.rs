@@ -68,13 +68,10 @@ impl Agent {
         self.ledger.open.extend(new.iter().map(|entry| Record::Entry { id: entry.id(), bytes: entry.encode() }));
         let submaps = gone.iter().map(|(submap, _)| *submap).collect();
         // Two submaps can share a blob: equal bytes have one address.
-        let kept: BTreeSet<Hash> = self
-            .knowledge
-            .submaps()
-            .map(|(id, known)| (id, known.blob))
-            .filter_map(|(id, blob)| gone.binary_search_by_key(&id, |(submap, _)| *submap).is_err().then_some(blob))
-            .collect();
-        let blobs = gone.iter().map(|(_, blob)| *blob).filter(|blob| !kept.contains(blob)).collect();
+        let stays = |id: &SubmapId| gone.binary_search_by_key(id, |(submap, _)| *submap).is_err();
+        let all = self.knowledge.submaps().filter(|(id, _)| stays(id));
+        let kept = self.with_further(all.map(|(_, known)| known.blob));
+        let blobs = self.with_further(gone.iter().map(|(_, blob)| *blob)).difference(&kept).copied().collect();
         self.ledger.open.push(Record::Replaced { below, submaps, blobs });
         gone.iter().for_each(|(submap, _)| self.negotiation.forget(*submap));
         self.forget_refusals(|submap| gone.binary_search_by_key(&submap, |(id, _)| *id).is_ok());

@@ -18,8 +18,8 @@ use crate::wire::{Beacon, BeaconContent};
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Raw blobs kept in memory to serve others.
-pub const BLOBS_MAX: usize = 2_048;
+/// Raw blobs kept in memory to serve others: of each own submap two.
+pub const BLOBS_MAX: usize = 4_096;
 /// A beacon that tells nothing new waits so many times `gossip.pose_secs`.
 const REPEAT_PAUSES: f64 = 2.5;
 /// Shortest time between two wishes ([`Message::AlignRequest`]).
@@ -92,11 +92,15 @@ impl Gossip {
         self.blobs.get(&hash).map(Vec::as_slice)
     }
 
-    /// Keeps a blob. Beyond [`BLOBS_MAX`] one goes that is not among `ours`, which are called for only then: what others
+    /// Whether a blob more makes another one go.
+    pub(super) fn is_full(&self) -> bool {
+        self.blobs.len() >= BLOBS_MAX
+    }
+
+    /// Keeps a blob. Beyond [`BLOBS_MAX`] one goes that is not among `ours`, which are told only then: what others
     /// made they can serve themselves. If all are ours, what others made is not kept.
-    pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>, ours: impl FnOnce() -> BTreeSet<Hash>) {
-        if self.blobs.len() >= BLOBS_MAX && !self.blobs.contains_key(&hash) {
-            let ours = ours();
+    pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>, ours: Option<BTreeSet<Hash>>) {
+        if let Some(ours) = ours.filter(|_| self.is_full() && !self.blobs.contains_key(&hash)) {
             let foreign = self.blobs.keys().find(|hash| !ours.contains(hash)).copied();
             match foreign {
                 Some(foreign) => _ = self.blobs.remove(&foreign),
@@ -414,7 +418,7 @@ mod tests {
         let ours: BTreeSet<Hash> = (0..=BLOBS_MAX).map(|number| blob(number).0).collect();
         let add = |gossip: &mut Gossip, number| {
             let (hash, bytes) = blob(number);
-            gossip.add_blob(hash, bytes, || ours.clone());
+            gossip.add_blob(hash, bytes, Some(ours.clone()));
         };
         let held = |gossip: &Gossip, numbers: core::ops::Range<usize>| {
             numbers.filter(|number| gossip.blob(blob(*number).0).is_some()).count()

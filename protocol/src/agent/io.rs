@@ -282,6 +282,15 @@ pub enum Event {
         /// Whether there was any.
         found: bool,
     },
+    /// We looked with further keypoints at a pair that was refused and that the map has overlap.
+    LookedAgain {
+        /// Target.
+        i: SubmapId,
+        /// Source.
+        j: SubmapId,
+        /// Whether there was an alignment that agrees with the map.
+        found: bool,
+    },
     /// We computed an alignment and stated it.
     AlignmentProposed {
         /// Target.

@@ -211,7 +211,8 @@ impl Agent {
         }
         // Only now it is known that they are ours.
         for (hash, bytes) in blobs {
-            self.gossip.add_blob(hash, bytes, || self.knowledge.blobs_of(self.me.robot));
+            let ours = self.gossip.is_full().then(|| self.own_blobs());
+            self.gossip.add_blob(hash, bytes, ours);
         }
         self.publish_entries(&own);
     }

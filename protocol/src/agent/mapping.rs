@@ -189,6 +189,9 @@ impl Agent {
         self.ledger.open.push(Record::Private { submap: id, bytes: described.features.encode() });
         self.keep_keypoints(hash, &blob);
         self.ledger.open.push(Record::Blob { hash, bytes: blob });
+        if let Some(bytes) = described.further.map(|further| further.encode()) {
+            self.ledger.open.push(Record::Blob { hash: Hash::of(&bytes), bytes });
+        }
         self.event(Event::SubmapFinished { submap: id, keypoints: described.keypoints.len() });
         self.negotiation.add_features(id, Arc::new(described.features));
     }
@@ -217,7 +220,8 @@ impl Agent {
     pub(super) fn keep_blob(&mut self, bytes: Vec<u8>) {
         let hash = Hash::of(&bytes);
         if self.keep_keypoints(hash, &bytes) {
-            self.gossip.add_blob(hash, bytes, || self.knowledge.blobs_of(self.me.robot));
+            let ours = self.gossip.is_full().then(|| self.own_blobs());
+            self.gossip.add_blob(hash, bytes, ours);
         }
     }
 

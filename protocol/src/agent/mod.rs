@@ -25,6 +25,7 @@ mod negotiation;
 mod promise;
 mod ranking;
 mod refusals;
+mod second_look;
 mod shortlist;
 mod sighting;
 mod solving;
@@ -38,6 +39,7 @@ mod view;
 use crate::config::{Config, ConfigError};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
 use crate::replica::{Replica, RosterError};
+use crate::submap::Keypoints;
 use crate::submap::runs::Runs;
 use crate::time::Instant;
 use crate::wire::fact::Fact;
@@ -57,7 +59,7 @@ use refusals::Refusals;
 use sighting::Positions;
 use solving::MapState;
 use stats::Stats;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use steps::Steps;
 use thiserror::Error;
 
@@ -70,6 +72,7 @@ pub use negotiation::{
     ALIGNMENTS_PER_FRAME_PAIR, ALIGNMENTS_PER_SUBMAP, FEATURES_MAX, KEYPOINTS_MAX, LOOKALIKES_MAX, TRIES_PER_SUBMAP,
 };
 pub use refusals::{REFUSED_MAX, REFUSED_WAITING_MAX};
+pub use second_look::SECOND_LOOKS_MAX;
 pub use sighting::{SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
 pub use traffic::{POSTPONED_MAX, UNSENT_MAX};
 
@@ -301,7 +304,11 @@ impl Agent {
         self.refusals.restore(refused);
         self.relearn();
         // Only now it is known which are ours; of others as many are taken as there is room for.
-        let ours = self.knowledge.blobs_of(self.me.robot);
+        let named = self.knowledge.blobs_of(self.me.robot);
+        let is_named = |bytes: &&Vec<u8>| named.contains(&Hash::of(bytes));
+        let further: Vec<Hash> =
+            blobs.iter().filter(is_named).filter_map(|bytes| Keypoints::address_in(bytes)).collect();
+        let ours: BTreeSet<Hash> = named.iter().copied().chain(further).collect();
         let (own, foreign): (Vec<_>, Vec<_>) = blobs.into_iter().partition(|bytes| ours.contains(&Hash::of(bytes)));
         own.into_iter().chain(foreign).take(BLOBS_MAX).for_each(|bytes| self.keep_blob(bytes));
         for (submap, bytes) in private {

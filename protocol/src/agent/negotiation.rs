@@ -5,7 +5,8 @@
 //! and submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant. Two frames with
 //! [`ALIGNMENTS_PER_FRAME_PAIR`] alignments are tied well enough as such; after that only submaps are aligned that have
 //! drifted from one another by the joint estimate: without these the map of a long drive would become that of its
-//! odometry. Every pair is tried once; every foreign alignment that names us is verified once.
+//! odometry. Every pair is tried once, and once more with [further keypoints](super::second_look) if it was refused and
+//! should not have been; every foreign alignment that names us is verified once.
 
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
@@ -73,6 +74,8 @@ pub struct Work {
     pub theirs: SubmapId,
     /// What for.
     pub purpose: Purpose,
+    /// With further keypoints, at a pair that the map calls for.
+    pub further: bool,
 }
 
 /// A blob on its way, piece by piece.
@@ -121,6 +124,8 @@ pub struct Negotiation {
     stirred: bool,
     /// Pairs we are not responsible for and would like to see tried.
     pub wishes: Shortlist,
+    /// Pairs that were refused and may be looked at again.
+    pub second_looks: Shortlist,
 }
 
 impl Negotiation {
@@ -140,6 +145,7 @@ impl Negotiation {
             begun: BTreeSet::new(),
             stirred: false,
             wishes: Shortlist::default(),
+            second_looks: Shortlist::default(),
         }
     }
 
@@ -182,8 +188,9 @@ impl Negotiation {
     /// Candidates and wishes that name a submap which is gone go as well.
     pub fn drop_unknown(&mut self, knowledge: &Knowledge) {
         let known = |candidate: &Candidate| knowledge.submap(candidate.theirs).is_some();
-        self.candidates.retain(known);
-        self.wishes.retain(known);
+        for list in [&mut self.candidates, &mut self.wishes, &mut self.second_looks] {
+            list.retain(known);
+        }
     }
 
     /// The features of an own submap.
@@ -235,7 +242,7 @@ impl Negotiation {
     /// Takes a pair off the list for good.
     pub fn mark_tried(&mut self, pair: Pair) {
         self.begun.remove(&pair);
-        if let Some(candidate) = self.candidates.remove(pair) {
+        for candidate in [self.candidates.remove(pair), self.second_looks.remove(pair)].into_iter().flatten() {
             *self.tries.entry((candidate.mine, candidate.theirs.frame)).or_default() += 1;
         }
         if self.tried.len() < TRIED_MAX {
@@ -265,6 +272,7 @@ impl Negotiation {
         let mut ranked: Vec<(f64, Pair, Candidate)> = self
             .candidates
             .iter()
+            .chain(self.second_looks.iter())
             .filter(|(_, c)| self.tries(c) < TRIES_PER_SUBMAP)
             .filter_map(|(pair, c)| gain(c).map(|g| (g, pair, *c)))
             .collect();
@@ -276,6 +284,7 @@ impl Negotiation {
     pub fn clear_candidates(&mut self) {
         self.candidates.clear();
         self.wishes.clear();
+        self.second_looks.clear();
         self.begun.clear();
         self.verify.clear();
     }
@@ -316,7 +325,7 @@ mod tests {
 
     fn candidate(index: u32, similarity: f64) -> Candidate {
         let similarity = Similarity { value: similarity, by: Looks::Summary };
-        Candidate { mine: submap(1, 0), theirs: submap(2, index), similarity, wished: false }
+        Candidate { mine: submap(1, 0), theirs: submap(2, index), similarity, wished: false, further: false }
     }
 
     #[test]

@@ -6,6 +6,7 @@ use super::allowance::FACT_BYTES;
 use super::knowledge::{Agreement, Pair, pair_of};
 use super::negotiation::{ALIGNMENTS_PER_SUBMAP, LOOPS_PER_SUBMAP, TRIES_PER_SUBMAP_FREE, TRIES_PER_SUBMAP_TIED};
 use super::promise::{Guess, Signs};
+use super::second_look;
 use super::shortlist::Candidate;
 use super::stated::Stated;
 use crate::geometry::Relative;
@@ -40,6 +41,8 @@ pub(super) struct Proposal {
     pub bytes: usize,
     /// How probable it is that it can be aligned.
     pub guess: Guess,
+    /// A second look, with further keypoints.
+    pub further: bool,
 }
 
 impl Agent {
@@ -55,7 +58,7 @@ impl Agent {
             let blob = self.knowledge.submap(mine).and_then(|known| self.gossip.blob(known.blob));
             let bytes = lacking * blob.map_or(0, <[u8]>::len) + 2 * FACT_BYTES;
             let guess = self.guess(&candidate);
-            Proposal { mine, theirs, may_wait: !joins && lacking > 0, bytes, guess }
+            Proposal { mine, theirs, may_wait: !joins && lacking > 0, bytes, guess, further: candidate.further }
         };
         self.negotiation.ranked(|candidate| self.gain(candidate, &stated)).into_iter().map(proposal).collect()
     }
@@ -94,6 +97,9 @@ impl Agent {
         // What bends a camera's submap is common to all its alignments: of LiDARs' alone many say more than a few.
         let averages = [pair.0, pair.1].into_iter().all(|id| self.knowledge.is_of_ranges(id));
         let Guess { probability, signs } = self.guess(candidate);
+        if candidate.further && !self.calls_for_second_look(candidate, &signs) {
+            return None;
+        }
         let told = if averages { told(signs.apart) } else { 1.0 };
         let limit = if is_loop && averages { part(LOOPS_PER_SUBMAP, told) } else { ALIGNMENTS_PER_SUBMAP };
         if stated.most_of_either(pair) >= limit.max(self.config.estimate.alignments_min) {
@@ -101,11 +107,16 @@ impl Agent {
         }
         let lacking = self.blobs_lacking(candidate, stated);
         let is_tied = stated.is_tied(pair);
-        let worth = told * probability * if candidate.wished { WISHED } else { 1.0 };
+        let favour = match (candidate.further, candidate.wished) {
+            (true, _) => second_look::WORTH,
+            (false, true) => WISHED,
+            (false, false) => 1.0,
+        };
+        let worth = told * probability * favour;
         let Some((at_a, at_b)) = self.anchor(pair.0).zip(self.anchor(pair.1)) else {
             return (!is_tied).then_some(1.5 + worth / (1 + lacking) as f64);
         };
-        if signs.apart.is_some_and(|apart| apart > 1.0) || probability < PROMISE_MIN {
+        if signs.apart.is_some_and(|apart| apart > 1.0) || (probability < PROMISE_MIN && !candidate.further) {
             return None;
         }
         let news = stated.sigma(pair).map(|sigma| drift_between(at_a, at_b) / (sigma * at_b.sim().scale));
@@ -138,18 +149,19 @@ impl Agent {
     }
 
     /// Keypoint blobs that must be sent, as far as we know, for both ends to look at a pair.
-    fn blobs_lacking(&self, Candidate { mine, theirs, .. }: &Candidate, stated: &Stated) -> usize {
+    fn blobs_lacking(&self, Candidate { mine, theirs, further, .. }: &Candidate, stated: &Stated) -> usize {
         if self.is_loop(*mine, *theirs) {
             return 0;
         }
-        let is_here = self.knowledge.submap(*theirs).is_some_and(|known| {
-            self.negotiation.keypoints(known.blob).is_some() || self.gossip.blob(known.blob).is_some()
-        });
-        usize::from(!is_here) + usize::from(stated.of_submap(*mine, theirs.frame) == 0)
+        let blob =
+            if *further { self.address_of(*theirs) } else { self.knowledge.submap(*theirs).map(|known| known.blob) };
+        let is_here =
+            blob.is_some_and(|blob| self.negotiation.keypoints(blob).is_some() || self.gossip.blob(blob).is_some());
+        usize::from(!is_here) + usize::from(*further || stated.of_submap(*mine, theirs.frame) == 0)
     }
 
     /// `t_own_anchor` by the joint estimate, if the submap is connected to us.
-    fn anchor(&self, id: SubmapId) -> Option<&Relative> {
+    pub(super) fn anchor(&self, id: SubmapId) -> Option<&Relative> {
         self.map.solved.anchors.get(&id)
     }
 }

@@ -16,6 +16,8 @@ pub struct Candidate {
     pub similarity: Similarity,
     /// The other endpoint asked for it.
     pub wished: bool,
+    /// It was refused, and is to be looked at again with further keypoints.
+    pub further: bool,
 }
 
 /// See the module.
@@ -93,7 +95,7 @@ mod tests {
     fn candidate(index: u32, similarity: f64) -> Candidate {
         let submap = |robot, index| SubmapId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 1 }, index };
         let similarity = Similarity { value: similarity, by: Looks::Summary };
-        Candidate { mine: submap(1, 0), theirs: submap(2, index), similarity, wished: false }
+        Candidate { mine: submap(1, 0), theirs: submap(2, index), similarity, wished: false, further: false }
     }
 
     fn kept(list: &Shortlist) -> Vec<u32> {

@@ -142,6 +142,12 @@ impl<const N: usize> Block<N> {
         Block { voxel: self.voxel, step: self.step, points: Vec::new() }
     }
 
+    /// These points and those of another block; `None` if its scales are others.
+    pub fn with(&self, other: &Self) -> Option<Self> {
+        let points = [&self.points[..], &other.points].concat();
+        (self.voxel == other.voxel && self.step == other.step).then_some(Self { points, ..*self })
+    }
+
     /// Edge of the thinning voxel, frame units.
     pub fn voxel(&self) -> f64 {
         f64::from(self.voxel)

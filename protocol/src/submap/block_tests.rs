@@ -1,8 +1,10 @@
+use super::super::landmarks::{Chart, Constellation};
 use super::super::testing::room;
 use super::super::{Features, Keypoints};
 use super::*;
+use crate::ids::Hash;
 use crate::submap::descriptor::PACKED_LEN;
-use crate::submap::features::KEYPOINTS_MAX;
+use crate::submap::features::{ADDRESS_LEN, KEYPOINTS_MAX};
 use proptest::prelude::*;
 
 /// Bytes of a keypoint.
@@ -20,15 +22,52 @@ fn what_was_described_is_what_was_decoded() {
     assert_eq!(Keypoints::decode(&described.keypoints.encode()).unwrap(), described.keypoints);
     assert_eq!(Features::decode(&described.features.encode()).unwrap(), described.features);
     assert_eq!(described.keypoints.len(), 300);
-    assert_eq!(described.keypoints.encode().len(), HEADER_LEN + 300 * POINT_LEN);
+    assert_eq!(described.keypoints.encode().len(), HEADER_LEN + 300 * POINT_LEN + ADDRESS_LEN);
     let first = described.keypoints.first(100);
     assert_eq!(first.surfels(), described.keypoints.surfels()[..100]);
 }
 
 #[test]
-fn a_point_costs_21_bytes_and_332_fit_in_7_kb() {
+fn a_point_costs_21_bytes_and_330_with_an_address_fit_in_7_kb() {
     assert_eq!(POINT_LEN, 21);
-    const { assert!(HEADER_LEN + 332 * POINT_LEN <= 7000) };
+    const { assert!(HEADER_LEN + 330 * POINT_LEN + ADDRESS_LEN <= 7000) };
+    const { assert!(HEADER_LEN + 331 * POINT_LEN + ADDRESS_LEN > 7000) };
+}
+
+#[test]
+fn a_blob_names_the_one_that_goes_on_with_it() {
+    let described = room(1);
+    let (first, further) = (&described.keypoints, described.further.as_ref().unwrap());
+    let (bytes, address) = (first.encode(), Hash::of(&further.encode()));
+    assert_eq!((first.further(), further.further()), (Some(address), None));
+    assert_eq!((bytes[5], &bytes[bytes.len() - ADDRESS_LEN..]), (1, &address.0[..]));
+    assert_eq!((Keypoints::address_in(&bytes), Keypoints::address_in(&further.encode())), (Some(address), None));
+    let both = first.with_further(further).unwrap();
+    assert_eq!((both.len(), both.further()), (first.len() + further.len(), None));
+    assert_eq!(both.surfels(), [first.surfels(), further.surfels()].concat());
+    // What is not of the same cloud is not added.
+    let coarser = Block::new(0.2, 1.0);
+    assert_eq!(first.with_further(&Keypoints::of_points(coarser)), None);
+    let landmarks = Chart::new(0.1, &Constellation::default());
+    assert_eq!(first.with_further(&Keypoints::of_landmarks(landmarks)), None);
+}
+
+#[test]
+fn a_blob_that_goes_on_nowhere_or_otherwise_is_refused() {
+    let bytes = room(1).keypoints.encode();
+    for len in 0..bytes.len() {
+        assert!(Keypoints::decode(&bytes[..len]).is_err(), "cut to {len}");
+    }
+    assert!(Keypoints::decode(&[&bytes[..], &[0]].concat()).is_err());
+    let expected = bytes.len() - ADDRESS_LEN;
+    assert_eq!(damaged(5, &[0]), Err(BlockError::WrongLength { len: bytes.len(), expected }));
+    for spare in [2, 255] {
+        assert!(matches!(damaged(5, &[spare]), Err(BlockError::UnknownLayout { .. })));
+    }
+    // The header is not taken for an address.
+    let ones = [1; HEADER_LEN + ADDRESS_LEN];
+    assert!((0..ones.len()).all(|len| Keypoints::address_in(&ones[..len]).is_none()));
+    assert_eq!(Keypoints::address_in(&ones), Some(Hash([1; ADDRESS_LEN])));
 }
 
 #[test]
@@ -96,6 +135,7 @@ proptest! {
     fn any_bytes_are_refused_or_come_back_the_same(
         mut bytes in prop::collection::vec(any::<u8>(), 0..HEADER_LEN + 4 * POINT_LEN),
         honest_header in any::<bool>(),
+        goes_on in any::<bool>(),
     ) {
         if honest_header && bytes.len() >= HEADER_LEN {
             let header = Block::<PACKED_LEN>::new(0.1, 1.0).encode(*b"mk");
@@ -103,6 +143,10 @@ proptest! {
             let count = (bytes.len() - HEADER_LEN) / POINT_LEN;
             bytes.truncate(HEADER_LEN + count * POINT_LEN);
             bytes[14..18].copy_from_slice(&(count as u32).to_le_bytes());
+            if goes_on {
+                bytes[5] = 1;
+                bytes.extend([7; ADDRESS_LEN]);
+            }
         }
         if let Ok(keypoints) = Keypoints::decode(&bytes) {
             prop_assert_eq!(keypoints.encode(), bytes);

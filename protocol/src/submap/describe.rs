@@ -8,7 +8,7 @@ use super::features::{Codes, FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints, U
 use super::landmarks;
 use super::planar;
 use super::rings;
-use super::sampling::spread;
+use super::sampling::{rest, spread};
 use super::summary::Summary;
 use super::surface::{Normal, normals};
 use crate::config::{Sensor, SubmapConfig};
@@ -27,6 +27,8 @@ pub struct Described {
     pub features: Features,
     /// The few that peers may fetch.
     pub keypoints: Keypoints,
+    /// Further ones, of which `keypoints` names the address.
+    pub further: Option<Keypoints>,
     /// What is gossiped.
     pub summary: Summary,
     /// Half extents of the cloud about the anchor, frame units.
@@ -73,25 +75,34 @@ fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {
     };
     let shaped: Vec<u32> =
         (0..).zip(&normals).filter(|(_, n)| n.neighbours > KEYPOINT_NEIGHBOURS_MIN).map(|(k, _)| k).collect();
-    let (keypoints, codes) = keypoints(&features.block, &shaped, config.keypoints.min(KEYPOINTS_MAX));
+    let [(keypoints, codes), (further, _)] =
+        keypoints(&features.block, &shaped, [config.keypoints, config.keypoints_further]);
+    let further = Some(further).filter(|further| !further.is_empty());
     let summary = Summary::of(config.voxel_m, &codes).seen_by(config.sensor);
-    Described { features, keypoints, summary, extent }
+    Described { keypoints: keypoints.before(further.as_ref()), features, further, summary, extent }
 }
 
-/// Up to `count` keypoints among the `shaped` points, and the descriptors of all that were considered, which cover the
-/// submap evenly. Descriptors are drawn from the block, as those of the features are.
-fn keypoints(block: &Block<0>, shaped: &[u32], count: usize) -> (Keypoints, Vec<Code>) {
+/// Keypoints among the `shaped` points, up to so many at first and so many further ones, each with the descriptors of all that
+/// were considered for them, which cover the submap evenly. Descriptors are drawn from the block, as those of the features
+/// are. The further ones change nothing of the first.
+fn keypoints(block: &Block<0>, shaped: &[u32], counts: [usize; 2]) -> [(Keypoints, Vec<Code>); 2] {
     let (points, normals) = in_voxels(block);
-    let considered = spread(&points, shaped, CANDIDATES_PER_KEYPOINT * count);
+    let counts = counts.map(|count| count.min(KEYPOINTS_MAX));
+    let mut considered = spread(&points, shaped, CANDIDATES_PER_KEYPOINT * counts[0]);
+    let first = considered.len();
+    considered.extend(spread(&points, &rest(shaped, &considered), CANDIDATES_PER_KEYPOINT * counts[1]));
     let numbers = rings::describe_points(&points, &normals, &considered);
     let projection = Projection::new();
-    let codes: Vec<Code> = numbers.iter().map(|n| projection.code(n)).collect();
-    let mut chosen = most_distinct(&codes);
-    chosen.truncate(count);
-    let mut keypoints = block.like();
-    let described = chosen.into_iter().map(|k| block.points[considered[k] as usize].with(projection.pack(&numbers[k])));
-    keypoints.points.extend(described);
-    (Keypoints::of_points(keypoints), codes)
+    [(0..first, counts[0]), (first..considered.len(), counts[1])].map(|(part, count)| {
+        let (considered, numbers) = (&considered[part.clone()], &numbers[part]);
+        let codes: Vec<Code> = numbers.iter().map(|n| projection.code(n)).collect();
+        let chosen = most_distinct(&codes).into_iter().take(count);
+        let mut keypoints = block.like();
+        keypoints
+            .points
+            .extend(chosen.map(|k| block.points[considered[k] as usize].with(projection.pack(&numbers[k]))));
+        (Keypoints::of_points(keypoints), codes)
+    })
 }
 
 /// Positions, in their order, of the share of the codes that differ most from the mean one.

@@ -88,6 +88,30 @@ fn keypoints_are_as_many_as_asked_for_within_the_limit() {
 }
 
 #[test]
+fn further_keypoints_change_nothing_of_the_first_and_are_others() {
+    let points = room_points(2);
+    let described = |keypoints_further| describe(&submap(&points), &SubmapConfig { keypoints_further, ..config() });
+    let alone = described(0);
+    assert_eq!((alone.further, alone.keypoints.further()), (None, None));
+    for (asked, given) in [(1, 1), (330, 330), (1024, 1024), (1025, 1024)] {
+        let Described { keypoints, further, features, summary, .. } = described(asked);
+        let further = further.unwrap();
+        assert_eq!(further.len(), given);
+        assert_eq!(
+            (keypoints.surfels(), &features, &summary),
+            (alone.keypoints.surfels(), &alone.features, &alone.summary)
+        );
+        let first = keypoints.surfels();
+        assert!(further.surfels().iter().all(|one| !first.contains(one)));
+        assert_eq!(keypoints.with_further(&further).unwrap().len(), keypoints.len() + given);
+    }
+    // Where the first take all there is, nothing goes on.
+    let few: Vec<_> = points.iter().take(150).copied().collect();
+    let few = describe(&submap(&few), &config());
+    assert_eq!((few.further, few.keypoints.further()), (None, None));
+}
+
+#[test]
 fn normals_look_back_at_the_keyframe_that_saw_them() {
     let mut builder = SubmapBuilder::new(config());
     let wall: Vec<_> = (0..900).map(|k| Vector3::new(2.0, f64::from(k % 30) * 0.1, f64::from(k / 30) * 0.1)).collect();

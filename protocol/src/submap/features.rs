@@ -2,6 +2,9 @@
 //! [`Features`] are all of them, kept privately by the owner. Both share one bounded layout; keypoints are the prefix
 //! of a priority order, so fewer are cut from more by keeping the first.
 //!
+//! A blob may be gone on with: it then ends with the address of another one that holds further keypoints, so that whoever
+//! trusts the first can trust the second. The spare byte of the header (position 5) tells so.
+//!
 //! Describing *all* points takes several times as long as everything else about a submap, and most submaps are never
 //! compared with a peer's. So keypoints carry their descriptors, and features come by theirs when first asked.
 
@@ -9,9 +12,14 @@ use super::block::{BARE_LEN, Block, BlockError, HEADER_LEN, Surfel};
 use super::descriptor::{Code, PACKED_LEN, Projection};
 use super::landmarks::{Chart, LANDMARKS_MAX};
 use super::rings;
+use crate::ids::Hash;
 use nalgebra::Vector3;
 use std::sync::OnceLock;
 
+/// Position of the header's byte that is 1 if an address ends the blob, else 0.
+const GOES_ON: usize = 5;
+/// Bytes of that address.
+pub const ADDRESS_LEN: usize = 32;
 /// Keypoints in a blob at most.
 pub const KEYPOINTS_MAX: usize = 1024;
 /// Features of a submap at most.
@@ -38,6 +46,8 @@ pub struct Keypoints {
     pub(super) block: Block<PACKED_LEN>,
     /// In the place of points, if these are landmarks.
     pub(super) landmarks: Option<Chart>,
+    /// Address of the blob that holds further ones.
+    further: Option<Hash>,
 }
 
 /// All described points of one's own submap, in the anchor frame, and from where they were seen.
@@ -68,20 +78,46 @@ impl PartialEq for Codes {
 impl Keypoints {
     /// Keypoints on surfaces.
     pub(super) fn of_points(block: Block<PACKED_LEN>) -> Self {
-        Self { block, landmarks: None }
+        Self { block, landmarks: None, further: None }
     }
 
     /// Landmarks.
     pub(super) fn of_landmarks(chart: Chart) -> Self {
-        Self { block: Block::new(chart.voxel(), 0.0), landmarks: Some(chart) }
+        Self { block: Block::new(chart.voxel(), 0.0), landmarks: Some(chart), further: None }
     }
 
-    /// The blob: at most 18 + 21 × [`KEYPOINTS_MAX`] bytes.
+    /// The same, which go on with these, if there are any.
+    #[must_use]
+    pub(super) fn before(self, further: Option<&Self>) -> Self {
+        Self { further: further.map(|further| Hash::of(&further.encode())), ..self }
+    }
+
+    /// Address of the blob that holds further keypoints of the submap.
+    pub fn further(&self) -> Option<Hash> {
+        self.further
+    }
+
+    /// These and further ones; `None` if those are not of the same submap.
+    pub fn with_further(&self, further: &Self) -> Option<Self> {
+        let landmarks = match (&self.landmarks, &further.landmarks) {
+            (None, None) => None,
+            (Some(first), Some(further)) => Some(first.with(further)?),
+            _ => return None,
+        };
+        Some(Self { block: self.block.with(&further.block)?, landmarks, further: further.further })
+    }
+
+    /// The blob: at most 18 + 21 × [`KEYPOINTS_MAX`] + [`ADDRESS_LEN`] bytes.
     pub fn encode(&self) -> Vec<u8> {
-        match &self.landmarks {
+        let mut bytes = match &self.landmarks {
             Some(chart) => chart.encode(LANDMARK_KEYPOINTS_MAGIC),
             None => self.block.encode(KEYPOINTS_MAGIC),
+        };
+        if let Some(Hash(address)) = self.further {
+            bytes[GOES_ON] = 1;
+            bytes.extend(address);
         }
+        bytes
     }
 
     /// Parses a blob.
@@ -89,6 +125,18 @@ impl Keypoints {
     /// # Errors
     /// [`BlockError`] if the bytes are not exactly what [`Keypoints::encode`] writes.
     pub fn decode(bytes: &[u8]) -> Result<Self, BlockError> {
+        let Some((first, address)) = split_address(bytes) else { return Self::decode_alone(bytes) };
+        let mut alone = first.to_vec();
+        alone[GOES_ON] = 0;
+        Ok(Self { further: Some(address), ..Self::decode_alone(&alone)? })
+    }
+
+    /// The address that ends a blob, without a look at the rest of it.
+    pub fn address_in(bytes: &[u8]) -> Option<Hash> {
+        split_address(bytes).map(|(_, address)| address)
+    }
+
+    fn decode_alone(bytes: &[u8]) -> Result<Self, BlockError> {
         if bytes.starts_with(&LANDMARK_KEYPOINTS_MAGIC) {
             return Chart::decode(bytes, LANDMARK_KEYPOINTS_MAGIC, LANDMARKS_MAX).map(Self::of_landmarks);
         }
@@ -100,7 +148,7 @@ impl Keypoints {
     pub fn first(&self, count: usize) -> Self {
         let mut block = self.block.like();
         block.points.extend(self.block.points.iter().take(count));
-        Self { block, landmarks: self.landmarks.as_ref().map(|chart| chart.first(count)) }
+        Self { block, landmarks: self.landmarks.as_ref().map(|chart| chart.first(count)), further: None }
     }
 
     /// The descriptors.
@@ -187,6 +235,14 @@ impl Features {
             }
         }
     }
+}
+
+/// A blob that is gone on with: what comes before the address, and the address.
+fn split_address(bytes: &[u8]) -> Option<(&[u8], Hash)> {
+    let goes_on = bytes.get(GOES_ON) == Some(&1);
+    let (first, address) =
+        bytes.split_last_chunk::<ADDRESS_LEN>().filter(|(first, _)| goes_on && first.len() >= HEADER_LEN)?;
+    Some((first, Hash(*address)))
 }
 
 /// Positions in voxels, and normals.

@@ -33,6 +33,13 @@ pub fn spread(points: &[[f32; 3]], candidates: &[u32], count: usize) -> Vec<u32>
     chosen
 }
 
+/// The candidates that were not chosen, in their order.
+pub fn rest(candidates: &[u32], chosen: &[u32]) -> Vec<u32> {
+    // Asked only whether it holds a position: its order reaches nothing.
+    let chosen: HashSet<u32> = chosen.iter().copied().collect();
+    candidates.iter().copied().filter(|k| !chosen.contains(k)).collect()
+}
+
 /// Up to `count` candidates in an order that only their voxels decide.
 fn at_random(points: &[[f32; 3]], candidates: &[u32], count: usize) -> Vec<u32> {
     let hashed = |&k: &u32| (hash_of(&points[k as usize].map(|x| x.floor() as i32)), k);

@@ -75,7 +75,8 @@ pub struct AlignmentFact {
     pub support: u16,
     /// log₁₀ of the number of false alarms.
     pub log10_nfa: f32,
-    /// Keypoint blobs of `i` and `j` it was computed from.
+    /// Keypoint blobs of `i` and `j` it was computed from. If the writer looked at further keypoints of the other's submap as
+    /// well, the blob that holds these stands in the place of that submap's first one, which names it.
     pub blobs: [Hash; 2],
 }
 

@@ -1,7 +1,7 @@
 //! A tiny shell for tests: agents joined by perfect wires, jobs run inline, a world of random boxes.
 
 use merganser_protocol::agent::io::{Channel, Event, Input, Output, QueryKind, Record};
-use merganser_protocol::agent::job::{Job, JobResult, NotAligned};
+use merganser_protocol::agent::job::{AlignJob, Job, JobResult, Measured, NotAligned};
 use merganser_protocol::agent::{Agent, Identity, Restored};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
@@ -130,6 +130,8 @@ fn gaussian(rng: &mut ChaCha8Rng) -> f64 {
     (0..12).map(|_| rng.random_range(0.0..1.0)).sum::<f64>() - 6.0
 }
 
+type Answers = Box<dyn Fn(&AlignJob) -> Option<Result<Box<Measured>, NotAligned>>>;
+
 /// Agents on perfect wires: everything is delivered at once, every record is durable at once.
 pub struct Wires {
     pub agents: Vec<Agent>,
@@ -141,8 +143,8 @@ pub struct Wires {
     pub published: Vec<(usize, Channel, Vec<u8>)>,
     /// Who asked for a piece of a blob, when, and the answer.
     pub pieces: Vec<(usize, Instant, Option<Vec<u8>>)>,
-    /// What every look at a loop of somebody's own comes to, if it is not to be run.
-    pub loops_end: Option<NotAligned>,
+    /// What a look at a pair comes to, if it is not to be run.
+    pub answers: Answers,
     inbox: VecDeque<(usize, Input)>,
 }
 
@@ -157,7 +159,7 @@ impl Wires {
             batches: Vec::new(),
             published: Vec::new(),
             pieces: Vec::new(),
-            loops_end: None,
+            answers: Box::new(|_| None),
             inbox: VecDeque::new(),
         };
         for a in 0..wires.agents.len() {
@@ -238,11 +240,8 @@ impl Wires {
             }
             Output::Answer { .. } => {}
             Output::Run { id, job } => {
-                let is_loop = matches!(&job, Job::Align(job) if job.back.is_some());
-                let result = match self.loops_end.filter(|_| is_loop) {
-                    Some(why) => JobResult::Aligned(Err(why)),
-                    None => job.run(),
-                };
+                let answer = if let Job::Align(job) = &job { (self.answers)(job) } else { None };
+                let result = answer.map_or_else(|| job.run(), JobResult::Aligned);
                 self.inbox.push_back((k, Input::JobDone { job: id, result }));
             }
             Output::Event(event) => self.events.push((k, event)),

@@ -3,7 +3,10 @@
 use super::common::{Wires, World, config, drive, identity, robot};
 use merganser_protocol::agent::io::{Command, Event, Input, Record};
 use merganser_protocol::agent::{Agent, Restored};
+use merganser_protocol::ids::Hash;
+use merganser_protocol::submap::Keypoints;
 use merganser_protocol::time::Instant;
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 /// Keyframes that one robot drives.
@@ -81,6 +84,17 @@ fn the_map_stays_and_the_bytes_go() {
         let silent =
             |edge: &&merganser_protocol::snapshot::EdgeView| edge.weight < 1.0 - 1e-9 && edge.reason.is_empty();
         assert_eq!(snapshot.graph.edges.iter().find(silent), None);
+    }
+    for disk in &short.disks {
+        // Of every submap that is left its keypoints and, where these go on, the further ones; of what is gone nothing.
+        let own = disk.iter().filter(|record| matches!(record, Record::Private { .. })).count();
+        let blob = |record: &Record| if let Record::Blob { bytes, .. } = record { Some(bytes.clone()) } else { None };
+        let blobs: Vec<Vec<u8>> = disk.iter().filter_map(blob).collect();
+        let named: BTreeSet<Hash> = blobs.iter().filter_map(|bytes| Keypoints::address_in(bytes)).collect();
+        let (further, first): (Vec<Hash>, Vec<Hash>) =
+            blobs.iter().map(|bytes| Hash::of(bytes)).partition(|hash| named.contains(hash));
+        assert_eq!((first.len(), further.len()), (own, named.len()));
+        assert!(!named.is_empty());
     }
     // What a late joiner fetches, what a restart reads.
     let entries = |wires: &Wires| {

@@ -17,7 +17,8 @@ const FRAME_EPOCH: u32 = 7;
 fn told(before: usize, elsewhere: bool) -> Vec<(u32, u32)> {
     let restored = Restored { records: log(before), fresh_epoch: FRAME_EPOCH };
     let mut wires = Wires::new(vec![Agent::new(config(), identity(0), 42, restored, Instant::ZERO).unwrap()]);
-    wires.loops_end = Some(NotAligned { reason: RefusalReason::Ambiguous, elsewhere });
+    let why = NotAligned { reason: RefusalReason::Ambiguous, elsewhere };
+    wires.answers = Box::new(move |job| job.back.is_some().then_some(Err(why)));
     for keyframe in drive(&World::new(1), 0, 60).0 {
         wires.input(0, Input::Keyframe(keyframe));
         wires.run(Duration::from_secs(1));

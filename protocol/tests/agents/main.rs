@@ -17,5 +17,6 @@ mod front_ends;
 mod link_budget;
 mod lookalikes;
 mod restarts;
+mod second_looks;
 mod sightings;
 mod third_parties;

@@ -46,7 +46,10 @@ impl StandIn {
                     let mut dice = Dice::new(self.seed, &format!("bent {features}"));
                     let place = Place { features, t_world_anchor, bent: Vector6::from_fn(|_, _| dice.normal()) };
                     self.places.insert(features, place);
-                    self.places.insert(Hash::of(&described.1.keypoints.encode()), place);
+                    let first = &described.1.keypoints;
+                    let both = described.1.further.as_ref().and_then(|further| first.with_further(further));
+                    self.places.insert(Hash::of(&first.encode()), place);
+                    both.map(|both| self.places.insert(Hash::of(&both.encode()), place));
                 }
                 (result, false)
             }

@@ -85,6 +85,19 @@ impl Chart {
         Self { landmarks: self.landmarks.iter().take(count).copied().collect(), ..*self }
     }
 
+    /// All but the first `count`.
+    #[must_use]
+    pub fn after(&self, count: usize) -> Self {
+        Self { landmarks: self.landmarks.iter().skip(count).copied().collect(), ..*self }
+    }
+
+    /// These landmarks and those of another chart; `None` if its scales or its common covariance are others.
+    pub fn with(&self, other: &Self) -> Option<Self> {
+        let landmarks = [&self.landmarks[..], &other.landmarks].concat();
+        let is_alike = (self.voxel, self.step, self.common) == (other.voxel, other.step, other.common);
+        is_alike.then_some(Self { landmarks, ..*self })
+    }
+
     /// As many of the first as fit into so many bytes.
     #[must_use]
     pub fn within(&self, bytes: usize) -> Self {

@@ -21,12 +21,16 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     let landmarks = &submap.constellation.landmarks;
     let extent = [0, 1, 2].map(|axis| landmarks.iter().fold(0.0, |most: f32, l| most.max(l.at[axis].abs() as f32)));
     let chart = Chart::new(config.voxel_m, &submap.constellation);
-    let keypoints = Keypoints::of_landmarks(chart.within(KEYPOINT_LEN * config.keypoints.min(KEYPOINTS_MAX)));
+    let within = |chart: &Chart, keypoints: usize| chart.within(KEYPOINT_LEN * keypoints.min(KEYPOINTS_MAX));
+    let first = within(&chart, config.keypoints);
+    let further = Some(within(&chart.after(first.len()), config.keypoints_further)).filter(|further| further.len() > 0);
+    let further = further.map(Keypoints::of_landmarks);
+    let keypoints = Keypoints::of_landmarks(first).before(further.as_ref());
     let viewpoints = submap.keyframes.iter().take(VIEWPOINTS_MAX);
     let viewpoints = viewpoints.map(|t| t.translation.map(|x| x as f32).into()).collect();
     let features = Features::of_landmarks(chart, viewpoints);
     let summary = Summary::of_landmarks(config.voxel_m, &shares(landmarks));
-    Described { features, keypoints, summary, extent }
+    Described { features, keypoints, further, summary, extent }
 }
 
 /// Which labels were seen, and how descriptors are spread: blind to where the submap lies, how it is turned and scaled.

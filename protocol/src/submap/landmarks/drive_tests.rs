@@ -1,11 +1,12 @@
 //! Submaps of robots that drive among landmarks: what is kept of their sightings, and what a keyframe may hold.
 
 use super::super::builder::{Submap, SubmapBuilder};
-use super::super::{CovarianceOf, Described, Keyframe, describe};
+use super::super::{CovarianceOf, Described, Keyframe, Keypoints, describe};
 use super::tests::{Dice, Thing, flat_frame, nees, normal, planar, vector, world};
-use super::{Mark, SIGMA_RANGE, register};
+use super::{Chart, Mark, SIGMA_RANGE, register};
 use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, So3};
+use crate::ids::Hash;
 use crate::submap::KeyframeError;
 use crate::time::Stamp;
 use nalgebra::{Matrix3, Vector3, Vector6};
@@ -182,6 +183,14 @@ fn memory_is_bounded_and_a_blob_stays_within_its_bytes() {
     let described = describe(&submap, &config(Sensor::Landmarks));
     assert_eq!(described.features.len(), super::LANDMARKS_MAX);
     let blob = described.keypoints.encode();
-    assert!((6_900..=7_000).contains(&blob.len()), "{}", blob.len());
+    let further = described.further.unwrap();
+    for (len, fewest) in [(blob.len(), 6_900), (further.encode().len(), 6_860)] {
+        assert!((fewest..=7_000).contains(&len), "{len}");
+    }
+    let both = described.keypoints.with_further(&further).unwrap();
+    let landmarks = |of: &Chart| of.landmarks();
+    let all = landmarks(described.features.landmarks.as_ref().unwrap());
+    assert_eq!(landmarks(both.landmarks.as_ref().unwrap()), all[..both.len()]);
+    assert_eq!(Keypoints::decode(&blob).unwrap().further(), Some(Hash::of(&further.encode())));
     assert!(described.summary.encode().len() <= super::super::SUMMARY_LEN_MAX);
 }

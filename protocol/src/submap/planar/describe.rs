@@ -5,7 +5,7 @@ use super::super::block::Block;
 use super::super::describe::Described;
 use super::super::descriptor::PACKED_LEN;
 use super::super::features::{Codes, FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints, UNSEEN, VIEWPOINTS_MAX};
-use super::super::sampling::spread;
+use super::super::sampling::{rest, spread};
 use super::super::summary::{Summary, WORDS};
 use super::super::surface::Normal;
 use super::chart::{Beam, passed};
@@ -74,16 +74,22 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     let clear: Vec<u32> = (0..).zip(&lines).filter(|(_, line)| line.roughness.is_some()).map(|(k, _)| k).collect();
     let in_voxels: Vec<[f32; 3]> = at.iter().map(|p| [p.x as f32, p.y as f32, 0.0]).collect();
     let chosen = spread(&in_voxels, &clear, config.keypoints.min(KEYPOINTS_MAX));
-    let mut keypoints = features.block.like();
+    let further = spread(&in_voxels, &rest(&clear, &chosen), config.keypoints_further.min(KEYPOINTS_MAX));
     let eyes = |k: u32| {
         let seen = features.viewpoints.get(usize::from(features.seen_from[k as usize]));
         seen.map_or([0; PACKED_LEN], |&[x, y, _]| packed([x, y], features.block.step()))
     };
-    keypoints.points.extend(chosen.iter().map(|&k| features.block.points[k as usize].with(eyes(k))));
+    let block = |chosen: &[u32]| {
+        let mut block = features.block.like();
+        block.points.extend(chosen.iter().map(|&k| features.block.points[k as usize].with(eyes(k))));
+        Keypoints::of_points(block)
+    };
+    let further = Some(block(&further)).filter(|further| !further.is_empty());
+    let keypoints = block(&chosen).before(further.as_ref());
     let paired: Vec<(Vector2<f64>, Vector2<f64>)> =
         chosen.iter().take(PAIRED).map(|&k| (at[k as usize], lines[k as usize].normal)).collect();
     let summary = Summary::of_shares(config.voxel_m, &shares(&paired));
-    Described { features, keypoints: Keypoints::of_points(keypoints), summary, extent }
+    Described { features, keypoints, further, summary, extent }
 }
 
 /// Where a keypoint was seen from (frame units) in the place of a descriptor, which a point of a floor plan has not: so

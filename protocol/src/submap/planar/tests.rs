@@ -102,6 +102,11 @@ fn a_hall_is_recognised_from_elsewhere_and_the_covariance_covers_the_error() {
     let there = driven(&hall(), &way(1.0, 1.5, 0.3, 9));
     let back = driven(&hall(), &way(6.0, 1.2, 2.9, 10));
     assert!(there.0.keypoints.encode().len() <= 7_000 && there.0.summary.encode().len() <= 400);
+    let (first, further) = (&there.0.keypoints, there.0.further.as_ref().unwrap());
+    let near = first.surfels();
+    assert!(further.surfels().iter().all(|one| !near.contains(one)) && first.further().is_some());
+    let both = first.with_further(further).unwrap();
+    assert!(register(&both, &back.0.features, &FlatConfig::default()).is_ok());
     for (theirs, mine) in [(&there, &back), (&back, &there)] {
         let found = aligned(theirs, mine).unwrap();
         let truth = (mine.1.inverse().after(&theirs.1)).se3(1.0);

@@ -82,6 +82,7 @@ pub fn run(options: &Mission) -> anyhow::Result<bool> {
     let frugal = traffic(&outcome, &mut out)?;
     work(&outcome, &mut out)?;
     expectations(&outcome, &mut out)?;
+    second_looks(&outcome, &mut out)?;
     Ok(merged && accurate && frugal)
 }
 
@@ -246,6 +247,22 @@ fn expectations(outcome: &Outcome<Agent>, out: &mut impl Write) -> anyhow::Resul
          than the rate {:.3}",
         fifths.collect::<Vec<_>>().join(", "),
         rate * (1.0 - rate)
+    )?;
+    Ok(())
+}
+
+/// How many refused pairs were looked at again, and what came of it.
+fn second_looks(outcome: &Outcome<Agent>, out: &mut impl Write) -> anyhow::Result<()> {
+    let looks = outcome.told.iter().filter_map(|(_, _, event)| match event {
+        Event::LookedAgain { found, .. } => Some(*found),
+        _ => None,
+    });
+    let looks: Vec<bool> = looks.collect();
+    let found = looks.iter().filter(|found| **found).count();
+    writeln!(
+        out,
+        "refused pairs looked at again with further keypoints: {}, of which {found} came to something",
+        looks.len()
     )?;
     Ok(())
 }

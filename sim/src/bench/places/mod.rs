@@ -23,8 +23,8 @@ pub struct Places {
     /// Folder that holds rgbd_7scenes, lidar_gtsam_points, kitti00_scans, kitti_poses_lidar and lidar2d_radish
     #[arg(long, value_name = "DIR")]
     pub data: PathBuf,
-    /// Keypoints sent one way: 332 are 7.0 kB
-    #[arg(long, default_value_t = 332, value_parser = clap::value_parser!(u16).range(16..=1024))]
+    /// Keypoints sent one way: 330, and the address of further ones, are 7.0 kB
+    #[arg(long, default_value_t = 330, value_parser = clap::value_parser!(u16).range(16..=1024))]
     pub keypoints: u16,
     /// The first seed of the random orientations
     #[arg(long, default_value_t = 1)]
