@@ -75,34 +75,29 @@ fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {
     };
     let shaped: Vec<u32> =
         (0..).zip(&normals).filter(|(_, n)| n.neighbours > KEYPOINT_NEIGHBOURS_MIN).map(|(k, _)| k).collect();
-    let [(keypoints, codes), (further, _)] =
-        keypoints(&features.block, &shaped, [config.keypoints, config.keypoints_further]);
+    let (keypoints, further, codes) = keypoints(&features.block, &shaped, [config.keypoints, config.keypoints_further]);
     let further = Some(further).filter(|further| !further.is_empty());
     let summary = Summary::of(config.voxel_m, &codes).seen_by(config.sensor);
     Described { keypoints: keypoints.before(further.as_ref()), features, further, summary, extent }
 }
 
-/// Keypoints among the `shaped` points, up to so many at first and so many further ones, each with the descriptors of all that
-/// were considered for them, which cover the submap evenly. Descriptors are drawn from the block, as those of the features
-/// are. The further ones change nothing of the first.
-fn keypoints(block: &Block<0>, shaped: &[u32], counts: [usize; 2]) -> [(Keypoints, Vec<Code>); 2] {
+/// Keypoints among the `shaped` points, up to so many at first and so many further ones, and the descriptors of all that were
+/// considered for the first, which cover the submap evenly. Descriptors are drawn from the block, as those of the features
+/// are. The further ones, seldom asked for, cover what was not considered evenly, and change nothing of the first.
+fn keypoints(block: &Block<0>, shaped: &[u32], counts: [usize; 2]) -> (Keypoints, Keypoints, Vec<Code>) {
     let (points, normals) = in_voxels(block);
-    let counts = counts.map(|count| count.min(KEYPOINTS_MAX));
-    let mut considered = spread(&points, shaped, CANDIDATES_PER_KEYPOINT * counts[0]);
-    let first = considered.len();
-    considered.extend(spread(&points, &rest(shaped, &considered), CANDIDATES_PER_KEYPOINT * counts[1]));
+    let [first, further] = counts.map(|count| count.min(KEYPOINTS_MAX));
+    let mut considered = spread(&points, shaped, CANDIDATES_PER_KEYPOINT * first);
+    let for_first = considered.len();
+    considered.extend(spread(&points, &rest(shaped, &considered, points.len()), further));
     let numbers = rings::describe_points(&points, &normals, &considered);
     let projection = Projection::new();
-    [(0..first, counts[0]), (first..considered.len(), counts[1])].map(|(part, count)| {
-        let (considered, numbers) = (&considered[part.clone()], &numbers[part]);
-        let codes: Vec<Code> = numbers.iter().map(|n| projection.code(n)).collect();
-        let chosen = most_distinct(&codes).into_iter().take(count);
-        let mut keypoints = block.like();
-        keypoints
-            .points
-            .extend(chosen.map(|k| block.points[considered[k] as usize].with(projection.pack(&numbers[k]))));
-        (Keypoints::of_points(keypoints), codes)
-    })
+    let codes: Vec<Code> = numbers[..for_first].iter().map(|n| projection.code(n)).collect();
+    let described = |k: usize| block.points[considered[k] as usize].with(projection.pack(&numbers[k]));
+    let (mut keypoints, mut others) = (block.like(), block.like());
+    keypoints.points.extend(most_distinct(&codes).into_iter().take(first).map(described));
+    others.points.extend((for_first..considered.len()).map(described));
+    (Keypoints::of_points(keypoints), Keypoints::of_points(others), codes)
 }
 
 /// Positions, in their order, of the share of the codes that differ most from the mean one.

@@ -33,11 +33,11 @@ pub fn spread(points: &[[f32; 3]], candidates: &[u32], count: usize) -> Vec<u32>
     chosen
 }
 
-/// The candidates that were not chosen, in their order.
-pub fn rest(candidates: &[u32], chosen: &[u32]) -> Vec<u32> {
-    // Asked only whether it holds a position: its order reaches nothing.
-    let chosen: HashSet<u32> = chosen.iter().copied().collect();
-    candidates.iter().copied().filter(|k| !chosen.contains(k)).collect()
+/// The candidates that were not chosen, in their order; all are positions among so many points.
+pub fn rest(candidates: &[u32], chosen: &[u32], points: usize) -> Vec<u32> {
+    let mut is_chosen = vec![false; points];
+    chosen.iter().for_each(|&k| is_chosen[k as usize] = true);
+    candidates.iter().copied().filter(|&k| !is_chosen[k as usize]).collect()
 }
 
 /// Up to `count` candidates in an order that only their voxels decide.

@@ -74,7 +74,8 @@ pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     let clear: Vec<u32> = (0..).zip(&lines).filter(|(_, line)| line.roughness.is_some()).map(|(k, _)| k).collect();
     let in_voxels: Vec<[f32; 3]> = at.iter().map(|p| [p.x as f32, p.y as f32, 0.0]).collect();
     let chosen = spread(&in_voxels, &clear, config.keypoints.min(KEYPOINTS_MAX));
-    let further = spread(&in_voxels, &rest(&clear, &chosen), config.keypoints_further.min(KEYPOINTS_MAX));
+    let further =
+        spread(&in_voxels, &rest(&clear, &chosen, in_voxels.len()), config.keypoints_further.min(KEYPOINTS_MAX));
     let eyes = |k: u32| {
         let seen = features.viewpoints.get(usize::from(features.seen_from[k as usize]));
         seen.map_or([0; PACKED_LEN], |&[x, y, _]| packed([x, y], features.block.step()))
