@@ -11,6 +11,7 @@
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
 use super::promise::{Guess, Promise};
+use super::second_look::SECOND_LOOKS_MAX;
 use super::shortlist::{Candidate, Shortlist};
 use crate::config::Sensor;
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
@@ -125,7 +126,7 @@ pub struct Negotiation {
     /// Pairs we are not responsible for and would like to see tried.
     pub wishes: Shortlist,
     /// Pairs that were refused and may be looked at again.
-    pub second_looks: Shortlist,
+    second_looks: Shortlist,
 }
 
 impl Negotiation {
@@ -222,6 +223,11 @@ impl Negotiation {
         if !self.tried.contains(&pair_of(candidate.mine, candidate.theirs)) {
             self.candidates.offer(candidate, limit);
         }
+    }
+
+    /// Notes a pair that was refused and may be looked at again; the least similar beyond [`SECOND_LOOKS_MAX`] goes.
+    pub fn add_second_look(&mut self, candidate: Candidate) {
+        self.second_looks.offer(candidate, SECOND_LOOKS_MAX);
     }
 
     /// Neither among candidates nor among wishes would a pair less similar than this be kept.
@@ -349,6 +355,22 @@ mod tests {
         }
         let kept: Vec<u32> = n.ranked(|c| Some(c.similarity.value)).iter().map(|c| c.theirs.index).collect();
         assert_eq!(kept, [9, 8, 7, 6, 5]);
+    }
+
+    #[test]
+    fn as_many_refused_pairs_wait_for_a_second_look_as_the_limit_says_and_each_has_one() {
+        let mut n = Negotiation::new(Sensor::Points3d);
+        let of = |k: usize| Candidate { further: true, ..candidate(k as u32, k as f64) };
+        let waiting = |n: &Negotiation| n.ranked(|c| c.further.then_some(c.similarity.value));
+        for (count, kept) in [(SECOND_LOOKS_MAX, SECOND_LOOKS_MAX), (1, SECOND_LOOKS_MAX)] {
+            let begin = n.second_looks.iter().count();
+            (begin..begin + count).for_each(|k| n.add_second_look(of(k)));
+            assert_eq!(waiting(&n).len(), kept);
+        }
+        assert!(waiting(&n).iter().all(|c| c.theirs.index > 0), "the least alike went");
+        let best = waiting(&n)[0];
+        n.mark_tried(pair_of(best.mine, best.theirs));
+        assert_eq!((waiting(&n).len(), n.tries(&best)), (SECOND_LOOKS_MAX - 1, 1));
     }
 
     #[test]

@@ -1,9 +1,9 @@
 //! A second look, with further keypoints, at a pair that was refused although the joint estimate says that it overlaps.
 //!
 //! A submap's blob names the address of another one that goes on with it. That one is fetched (of our own submaps, read) only
-//! then: the pair was refused as too little to go by, and the map of both says that they overlap, of which most pairs are
-//! found. What a second look finds counts only if it agrees with the map that called for it: it makes surer what is known,
-//! and joins nothing. (Where nothing connects two frames, more keypoints find hardly a true pair more, and sooner a false one.)
+//! then: too few matches held, and by the map the two overlap by most of what they saw. What a second look finds counts only
+//! if it agrees with the map that called for it: it makes surer what is known, and joins nothing. (Where nothing connects two
+//! frames, more keypoints find hardly a true pair more, and sooner a false one.)
 
 use super::Agent;
 use super::knowledge::pair_of;
@@ -36,7 +36,7 @@ impl Agent {
         if too_little && !work.further && self.address_of(work.theirs).is_some() {
             let (mine, theirs, similarity) = (work.mine, work.theirs, guess.signs.similarity);
             let candidate = Candidate { mine, theirs, similarity, wished: false, further: true };
-            self.negotiation.second_looks.offer(candidate, SECOND_LOOKS_MAX);
+            self.negotiation.add_second_look(candidate);
         }
     }
 
@@ -72,8 +72,8 @@ impl Agent {
         if blob(theirs) != Some(of_theirs) {
             return None;
         }
-        let further = Some(of_mine) == self.address_of(mine) && self.are_connected(mine, theirs);
-        (further || blob(mine) == Some(of_mine) || Some(of_mine) == self.address_of(mine)).then_some(further)
+        let is_further = self.address_of(mine) == Some(of_mine);
+        (is_further || blob(mine) == Some(of_mine)).then(|| is_further && self.are_connected(mine, theirs))
     }
 
     /// Where a submap's keypoints go on, if they do and those that say so are here.
