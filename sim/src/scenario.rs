@@ -106,6 +106,8 @@ pub struct SummaryOptions {
     pub sigma: [f64; 2],
     /// Share of an alignment's variance that all alignments of the one submap have in common, and of the other: 0 to 0.5.
     pub common: f64,
+    /// Share of the pairs that align which are refused at first sight, and found with further keypoints.
+    pub refused_at_first: f64,
     /// Whether the joint estimate is solved; else robots believe nothing about one another.
     pub solve: bool,
     /// Robots that state false alignments, each its own falsehood.
@@ -114,7 +116,15 @@ pub struct SummaryOptions {
 
 impl Default for SummaryOptions {
     fn default() -> Self {
-        Self { points: 24, reach_m: 6.0, sigma: [0.02, 0.005], common: 0.0, solve: true, liars: Vec::new() }
+        Self {
+            points: 24,
+            reach_m: 6.0,
+            sigma: [0.02, 0.005],
+            common: 0.0,
+            refused_at_first: 0.0,
+            solve: true,
+            liars: Vec::new(),
+        }
     }
 }
 
@@ -213,6 +223,7 @@ impl Scenario {
             range("summary.sigma[0]", summary.sigma[0], 1e-6, 10.0, "use 1e-6 to 10 m")?;
             range("summary.sigma[1]", summary.sigma[1], 1e-6, 1.0, "use 1e-6 to 1 rad")?;
             range("summary.common", summary.common, 0.0, 0.5, "use 0 to 0.5")?;
+            range("summary.refused_at_first", summary.refused_at_first, 0.0, 1.0, "use 0 to 1")?;
             summary.liars.iter().try_for_each(|liar| self.validate_name("summary.liars", liar))?;
         }
         self.validate_landmarks()?;

@@ -120,8 +120,8 @@ impl Agent {
                 self.negotiation.verify.remove(&id);
                 continue;
             };
-            let (mine, theirs) = if fact.i.frame.robot == self.me.robot { (fact.i, fact.j) } else { (fact.j, fact.i) };
-            let further = self.is_second_look(&fact, mine, theirs);
+            let (mine, theirs) = self.ours_first(&fact);
+            let further = self.is_second_look(&fact);
             let Some(further) = further.filter(|_| self.negotiation.features(mine).is_some()) else {
                 self.negotiation.verify.remove(&id);
                 self.write_verdict(id, VerdictOutcome::Refused(RefusalReason::BadInput));
@@ -169,14 +169,20 @@ impl Agent {
     pub(super) fn answers_owed(&self) -> Vec<EntryId> {
         let reachable = |id: &&EntryId| {
             let fact = self.knowledge.alignment(**id);
-            fact.is_none_or(|fact| !self.is_out_of_reach(fact.i) && !self.is_out_of_reach(fact.j))
+            fact.is_none_or(|fact| {
+                !self.is_out_of_reach(fact.i) && !self.is_out_of_reach(fact.j) && self.may_look_again_at(fact)
+            })
         };
         self.negotiation.verify.iter().filter(reachable).copied().collect()
     }
 
     /// Starts aligning a pair, if the keypoints it takes are here; otherwise has them fetched.
     fn start_alignment(&mut self, mine: SubmapId, theirs: SubmapId, purpose: Purpose, further: bool) -> bool {
-        let Some(keypoints) = self.keypoints_of(theirs, further) else { return false };
+        let Some((keypoints, used)) = self.keypoints_of(theirs, further) else { return false };
+        if further && used.is_none() && matches!(purpose, Purpose::Propose(_)) {
+            // There is nothing to be seen that was not at first.
+            return true;
+        }
         let Some(features) = self.negotiation.features(mine).cloned() else { return false };
         let back = self.is_loop(mine, theirs).then(|| self.looking_back(mine, theirs, further));
         if back.as_ref().is_some_and(Option::is_none) {
@@ -198,7 +204,7 @@ impl Agent {
             seed: self.pair_seed(pair_of(mine, theirs)),
         };
         let id = self.run_job(Job::Align(Box::new(job)));
-        self.negotiation.running.insert(id, Work { mine, theirs, purpose, further });
+        self.negotiation.running.insert(id, Work { mine, theirs, purpose, further: used });
         true
     }
 
@@ -216,7 +222,7 @@ impl Agent {
     /// What it takes to look at a loop from its other end as well.
     fn looking_back(&mut self, mine: SubmapId, theirs: SubmapId, further: bool) -> Option<Look> {
         let features = self.negotiation.features(theirs).cloned()?;
-        Some((self.keypoints_of(mine, further)?, features))
+        Some((self.keypoints_of(mine, further)?.0, features))
     }
 
     /// What a blob of this submap says, if it is here; otherwise it is fetched.
@@ -298,13 +304,13 @@ impl Agent {
 
     pub(super) fn on_aligned(&mut self, job: JobId, outcome: Result<Box<Measured>, NotAligned>) {
         let Some(work) = self.negotiation.running.remove(&job) else { return };
-        let outcome = match outcome {
-            Ok(measured) if work.further && !self.agrees_with_map(&work, &measured.t_mine_theirs) => {
-                Err(RefusalReason::NoConsensus.into())
-            }
-            outcome => outcome,
-        };
         self.negotiation.stir();
+        let agrees = outcome.as_ref().map_or(Some(true), |found| self.agrees_with_map(&work, &found.t_mine_theirs));
+        let outcome = match agrees {
+            Some(true) => outcome,
+            Some(false) => Err(RefusalReason::NoConsensus.into()),
+            None => return self.put_off(&work),
+        };
         self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
         match work.purpose {
             Purpose::Propose(guess) => {
@@ -349,12 +355,19 @@ impl Agent {
 
     fn tell_try(&mut self, work: &Work, guess: Guess, found: bool) {
         let (i, j) = pair_of(work.mine, work.theirs);
-        if work.further {
+        if work.further.is_some() {
             self.stats.worked(if found { "second_look_aligned" } else { "second_look_refused" });
             return self.event(Event::LookedAgain { i, j, found });
         }
         self.negotiation.promise.learn(&guess.signs, found);
         self.event(Event::AlignmentTried { i, j, expected: guess.probability, found });
+    }
+
+    /// A second look of which our map cannot say any more whether it agrees: an answer that is owed waits until it can.
+    fn put_off(&mut self, work: &Work) {
+        if let Purpose::Verify(id) = work.purpose {
+            self.negotiation.verify.insert(id);
+        }
     }
 
     fn propose(&mut self, work: &Work, measured: &Measured) {

@@ -42,7 +42,7 @@ impl Logs {
             };
             let log = logs.get_mut(&i.frame).unwrap();
             let alignment = EntryId { frame: i.frame, seq: log.len() as u32 };
-            let blobs = [Hash::default(); 2];
+            let blobs = [blob_of(i.index), blob_of(j.index)];
             log.push(Fact::Alignment(AlignmentFact { i, j, t_i_j, sigma: 0.1, support: 20, log10_nfa: -9.0, blobs }));
             let outcome = VerdictOutcome::Measured { t_i_j, sigma: 0.1, support: 20 };
             verdicts.push((j.frame, Fact::Verdict(VerdictFact { alignment, outcome })));
@@ -131,6 +131,10 @@ fn entry(seq: u32, floor: u32, fact: &Fact) -> Entry {
     signed(1, 4, seq, floor, if seq == 0 { Hash::default() } else { Hash::of(b"before") }, fact)
 }
 
+fn blob_of(index: u32) -> Hash {
+    Hash::of(&index.to_le_bytes())
+}
+
 fn submap(index: u32, odometry: PoseWithCovariance) -> Fact {
     Fact::Submap(SubmapFact {
         index,
@@ -139,7 +143,7 @@ fn submap(index: u32, odometry: PoseWithCovariance) -> Fact {
         extent: [1.0; 3],
         summary: vec![],
         keypoint_count: 1,
-        blob: Hash::of(&index.to_le_bytes()),
+        blob: blob_of(index),
         scale: ScaleKind::Metric,
         keyframes: None,
     })

@@ -7,6 +7,7 @@ use super::beacons::SeenBeacon;
 use super::io::{AskToken, Channel, Output, QueryId, QueryKind};
 use super::knowledge::{Pair, pair_of};
 use super::ledger::BATCHES_WAITING_MAX;
+use super::recent::Recent;
 use super::traffic::{Traffic, is_piece};
 use crate::config::GossipConfig;
 use crate::gossip::{Answer, Class, Spread, Step};
@@ -30,7 +31,7 @@ pub(super) struct Gossip {
     pub(super) spread: Spread,
     pub(super) traffic: Traffic,
     beacons: BTreeMap<RobotId, SeenBeacon>,
-    blobs: BTreeMap<Hash, Vec<u8>>,
+    blobs: Recent<Vec<u8>>,
     questions: BTreeMap<QueryId, Question>,
     /// When the last beacon of ours went out, and the keyframe that it told of.
     posed: (Instant, Option<Stamp>),
@@ -61,7 +62,7 @@ impl Gossip {
             spread: Spread::new(me, config.have_secs, config.answer_secs, now),
             traffic: Traffic::new(config.link_bytes_per_sec, now),
             beacons: BTreeMap::new(),
-            blobs: BTreeMap::new(),
+            blobs: Recent::default(),
             questions: BTreeMap::new(),
             posed: (now, None),
             next_piece: now,
@@ -89,7 +90,7 @@ impl Gossip {
     }
 
     pub(super) fn blob(&self, hash: Hash) -> Option<&[u8]> {
-        self.blobs.get(&hash).map(Vec::as_slice)
+        self.blobs.get(hash).map(Vec::as_slice)
     }
 
     /// Whether a blob more makes another one go.
@@ -100,12 +101,11 @@ impl Gossip {
     /// Keeps a blob. Beyond [`BLOBS_MAX`] one goes that is not among `ours`, which are told only then: what others
     /// made they can serve themselves. If all are ours, what others made is not kept.
     pub(super) fn add_blob(&mut self, hash: Hash, bytes: Vec<u8>, ours: Option<BTreeSet<Hash>>) {
-        if let Some(ours) = ours.filter(|_| self.is_full() && !self.blobs.contains_key(&hash)) {
-            let foreign = self.blobs.keys().find(|hash| !ours.contains(hash)).copied();
-            match foreign {
-                Some(foreign) => _ = self.blobs.remove(&foreign),
-                None if ours.contains(&hash) => _ = self.blobs.pop_first(),
-                None => return,
+        if let Some(ours) = ours.filter(|_| self.is_full() && self.blobs.get(hash).is_none()) {
+            let has_gone = self.blobs.drop_oldest(|hash| !ours.contains(hash))
+                || (ours.contains(&hash) && self.blobs.drop_oldest(|_| true));
+            if !has_gone {
+                return;
             }
         }
         self.blobs.insert(hash, bytes);

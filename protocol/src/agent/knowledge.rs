@@ -230,6 +230,12 @@ impl Knowledge {
         self.verdicts.get(&alignment).is_some_and(|all| all.keys().any(|id| id.frame.robot == robot))
     }
 
+    /// Whether an alignment names other blobs than its submaps' own facts do: it was computed from further keypoints.
+    fn is_second_look(&self, fact: &AlignmentFact) -> bool {
+        let stated = |id: SubmapId| self.submap(id).map(|known| known.blob);
+        [stated(fact.i), stated(fact.j)] != fact.blobs.map(Some)
+    }
+
     /// What the two endpoints make of an alignment.
     pub fn agreement(&self, id: EntryId) -> Agreement {
         self.agreements.get(&id).copied().unwrap_or(Agreement::Waiting)
@@ -293,6 +299,8 @@ impl Knowledge {
             })
             .collect();
         let common = agreed.iter().map(|(tie, common)| (tie.entry, *common)).collect();
+        let is_second = |entry: &EntryId| self.alignments.get(entry).is_some_and(|fact| self.is_second_look(fact));
+        let second_looks = agreed.iter().map(|(tie, _)| tie.entry).filter(is_second).collect();
         let alignments: Vec<AgreedAlignment> = agreed.into_iter().map(|(tie, _)| tie).collect();
         let sightings = self.sightings.iter();
         let sightings: Vec<AgreedAlignment> =
@@ -325,6 +333,7 @@ impl Knowledge {
                 positions,
                 common,
                 ambiguous: self.ambiguous(),
+                second_looks,
             },
             alone: alone.into_iter().map(|(frame, chain)| (frame, chain.len())).collect(),
             gaps: gaps.collect(),

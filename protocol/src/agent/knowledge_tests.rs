@@ -62,6 +62,23 @@ fn knowledge(facts: &[(EntryId, Fact)]) -> Knowledge {
     knowledge
 }
 
+/// A submap's fact names the blob that a first look is at.
+#[test]
+fn an_alignment_from_other_keypoints_is_a_second_look() {
+    let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));
+    let verdict = (entry(2, 1), verdict(stated.0, 3.03, 0.02));
+    let second_looks = |blobs: [Hash; 2]| {
+        let Fact::Alignment(fact) = stated.1.clone() else { panic!("{stated:?}") };
+        let stated = (stated.0, Fact::Alignment(AlignmentFact { blobs, ..fact }));
+        problem(&knowledge(&[stated, verdict.clone()])).second_looks
+    };
+    let (first, further) = (Hash::default(), Hash([1; 32]));
+    assert_eq!(second_looks([first; 2]), BTreeSet::new());
+    for blobs in [[first, further], [further, first], [further; 2]] {
+        assert_eq!(second_looks(blobs), BTreeSet::from([stated.0]));
+    }
+}
+
 #[test]
 fn an_alignment_moves_nothing_until_the_other_endpoint_measured_the_same() {
     let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));

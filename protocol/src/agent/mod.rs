@@ -24,6 +24,7 @@ mod mapping;
 mod negotiation;
 mod promise;
 mod ranking;
+mod recent;
 mod refusals;
 mod second_look;
 mod shortlist;
@@ -357,6 +358,7 @@ impl Agent {
             }
             self.knowledge.absorb(id, fact);
         }
+        self.negotiation.drop_unknown(&self.knowledge);
         calling.iter().for_each(|(id, fact)| self.on_fact(*id, fact));
         self.weigh_refusals();
         self.note_all_candidates();

@@ -11,6 +11,7 @@
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
 use super::promise::{Guess, Promise};
+use super::recent::Recent;
 use super::second_look::SECOND_LOOKS_MAX;
 use super::shortlist::{Candidate, Shortlist};
 use crate::config::Sensor;
@@ -75,8 +76,8 @@ pub struct Work {
     pub theirs: SubmapId,
     /// What for.
     pub purpose: Purpose,
-    /// With further keypoints, at a pair that the map calls for.
-    pub further: bool,
+    /// The blob of further keypoints that is looked at as well, at a pair that the map calls for.
+    pub further: Option<Hash>,
 }
 
 /// A blob on its way, piece by piece.
@@ -105,7 +106,7 @@ impl Fetch {
 #[derive(Debug)]
 pub struct Negotiation {
     features: BTreeMap<SubmapId, Arc<Features>>,
-    keypoints: BTreeMap<Hash, Arc<Keypoints>>,
+    keypoints: Recent<Arc<Keypoints>>,
     candidates: Shortlist,
     tried: BTreeSet<Pair>,
     tries: BTreeMap<(SubmapId, FrameId), usize>,
@@ -134,7 +135,7 @@ impl Negotiation {
     pub fn new(sensor: Sensor) -> Self {
         Self {
             features: BTreeMap::new(),
-            keypoints: BTreeMap::new(),
+            keypoints: Recent::default(),
             candidates: Shortlist::default(),
             tried: BTreeSet::new(),
             tries: BTreeMap::new(),
@@ -204,10 +205,10 @@ impl Negotiation {
         self.features.keys().copied()
     }
 
-    /// Keeps a decoded blob; a full cache drops one that no fetch waits for.
+    /// Keeps a decoded blob; a full cache drops the one that came first.
     pub fn add_keypoints(&mut self, hash: Hash, keypoints: Arc<Keypoints>) {
         if self.keypoints.len() >= KEYPOINTS_MAX {
-            self.keypoints.pop_first();
+            self.keypoints.drop_oldest(|_| true);
         }
         self.stirred = true;
         self.keypoints.insert(hash, keypoints);
@@ -215,7 +216,7 @@ impl Negotiation {
 
     /// A decoded blob.
     pub fn keypoints(&self, hash: Hash) -> Option<&Arc<Keypoints>> {
-        self.keypoints.get(&hash)
+        self.keypoints.get(hash)
     }
 
     /// Notes a pair that may overlap; the least similar beyond `limit` goes.
@@ -248,7 +249,8 @@ impl Negotiation {
     /// Takes a pair off the list for good.
     pub fn mark_tried(&mut self, pair: Pair) {
         self.begun.remove(&pair);
-        for candidate in [self.candidates.remove(pair), self.second_looks.remove(pair)].into_iter().flatten() {
+        self.second_looks.remove(pair);
+        if let Some(candidate) = self.candidates.remove(pair) {
             *self.tries.entry((candidate.mine, candidate.theirs.frame)).or_default() += 1;
         }
         if self.tried.len() < TRIED_MAX {
@@ -286,11 +288,10 @@ impl Negotiation {
         ranked.into_iter().map(|(_, _, candidate)| candidate).collect()
     }
 
-    /// Forgets all candidates (the set of facts was rebuilt).
+    /// Forgets all candidates (the set of facts was rebuilt). What was refused stays tried, and may be looked at again.
     pub fn clear_candidates(&mut self) {
         self.candidates.clear();
         self.wishes.clear();
-        self.second_looks.clear();
         self.begun.clear();
         self.verify.clear();
     }
@@ -370,7 +371,11 @@ mod tests {
         assert!(waiting(&n).iter().all(|c| c.theirs.index > 0), "the least alike went");
         let best = waiting(&n)[0];
         n.mark_tried(pair_of(best.mine, best.theirs));
-        assert_eq!((waiting(&n).len(), n.tries(&best)), (SECOND_LOOKS_MAX - 1, 1));
+        assert_eq!(
+            (waiting(&n).len(), n.tries(&best)),
+            (SECOND_LOOKS_MAX - 1, 0),
+            "it takes no first look from others"
+        );
     }
 
     #[test]

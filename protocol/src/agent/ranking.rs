@@ -55,8 +55,7 @@ impl Agent {
             let joins = !self.are_connected(mine, theirs) && stated.between(pair_of(mine, theirs)) < enough;
             let lacking = self.blobs_lacking(&candidate, &stated);
             // Theirs is about as long as ours.
-            let blob = self.knowledge.submap(mine).and_then(|known| self.gossip.blob(known.blob));
-            let bytes = lacking * blob.map_or(0, <[u8]>::len) + 2 * FACT_BYTES;
+            let bytes = lacking * self.blob_of(mine, candidate.further).map_or(0, <[u8]>::len) + 2 * FACT_BYTES;
             let guess = self.guess(&candidate);
             Proposal { mine, theirs, may_wait: !joins && lacking > 0, bytes, guess, further: candidate.further }
         };
@@ -97,7 +96,7 @@ impl Agent {
         // What bends a camera's submap is common to all its alignments: of LiDARs' alone many say more than a few.
         let averages = [pair.0, pair.1].into_iter().all(|id| self.knowledge.is_of_ranges(id));
         let Guess { probability, signs } = self.guess(candidate);
-        if candidate.further && !self.calls_for_second_look(candidate, &signs) {
+        if candidate.further && !self.calls_for_second_look(candidate) {
             return None;
         }
         let told = if averages { told(signs.apart) } else { 1.0 };
@@ -142,8 +141,15 @@ impl Agent {
         apart((self.anchor(a)?, self.reach(a)), (self.anchor(b)?, self.reach(b)))
     }
 
+    /// How far they are at the most that is likely, in units of what both reach.
+    pub(super) fn apart_at_most(&self, (a, b): Pair) -> Option<f64> {
+        let (at_a, at_b) = (self.anchor(a)?, self.anchor(b)?);
+        let (apart, drift, reach) = distances((at_a, self.reach(a)), (at_b, self.reach(b)));
+        Some((apart + drift) / reach)
+    }
+
     /// How far from its anchor a submap may still overlap another, in its frame's unit: half its extent.
-    fn reach(&self, id: SubmapId) -> f64 {
+    pub(super) fn reach(&self, id: SubmapId) -> f64 {
         let [x, y, z] = self.knowledge.submap(id).map_or([0.0; 3], |fact| fact.extent).map(f64::from);
         0.5 * (x * x + y * y + z * z).sqrt()
     }
@@ -158,6 +164,12 @@ impl Agent {
         let is_here =
             blob.is_some_and(|blob| self.negotiation.keypoints(blob).is_some() || self.gossip.blob(blob).is_some());
         usize::from(!is_here) + usize::from(*further || stated.of_submap(*mine, theirs.frame) == 0)
+    }
+
+    /// The keypoints of a submap as they are sent, or the further ones, if they are here.
+    fn blob_of(&self, id: SubmapId, further: bool) -> Option<&[u8]> {
+        let hash = if further { self.address_of(id)? } else { self.knowledge.submap(id)?.blob };
+        self.gossip.blob(hash)
     }
 
     /// `t_own_anchor` by the joint estimate, if the submap is connected to us.
@@ -180,12 +192,17 @@ fn part(of: usize, told: f64) -> usize {
 /// How far two anchors are from one another, at the least that is likely: 0 where they may be at one place, 1 where, as far
 /// as one can tell from their reaches, the submaps just touch. `None` where nothing is known of that, for one has drifted
 /// from the other by more than both reach: such a pair must not be passed over, nor count as near.
-fn apart((at_a, reach_a): (&Relative, f64), (at_b, reach_b): (&Relative, f64)) -> Option<f64> {
-    let apart = (at_a.sim().translation - at_b.sim().translation).norm();
-    let reach = at_a.sim().scale * reach_a + at_b.sim().scale * reach_b;
-    let drift = DRIFT_SIGMAS * drift_between(at_a, at_b);
+fn apart(a: (&Relative, f64), b: (&Relative, f64)) -> Option<f64> {
+    let (apart, drift, reach) = distances(a, b);
     let least = (apart - drift).max(0.0);
     (drift <= reach).then_some(if least == 0.0 { 0.0 } else { least / reach })
+}
+
+/// Of two anchors: their distance, by how much it may be wrong, and what their submaps reach together.
+fn distances((at_a, reach_a): (&Relative, f64), (at_b, reach_b): (&Relative, f64)) -> (f64, f64, f64) {
+    let apart = (at_a.sim().translation - at_b.sim().translation).norm();
+    let reach = at_a.sim().scale * reach_a + at_b.sim().scale * reach_b;
+    (apart, DRIFT_SIGMAS * drift_between(at_a, at_b), reach)
 }
 
 /// The least that the standard deviation of two anchors' distance vector can be, over all axes, in the unit of the frame that

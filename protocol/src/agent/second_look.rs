@@ -2,13 +2,15 @@
 //!
 //! A submap's blob names the address of another one that goes on with it. That one is fetched (of our own submaps, read) only
 //! then: too few matches held, and by the map the two overlap by most of what they saw. What a second look finds counts only
-//! if it agrees with the map that called for it: it makes surer what is known, and joins nothing. (Where nothing connects two
-//! frames, more keypoints find hardly a true pair more, and sooner a false one.)
+//! if it is where the map that called for it has it, and the estimate lets it speak for no merge
+//! ([`MapProblem::second_looks`](crate::estimate::joint::MapProblem::second_looks)): what was looked for where it was expected
+//! is no witness that it lies there. So it makes surer what is known, and joins nothing. (Where nothing connects two frames,
+//! more keypoints find hardly a true pair more, and sooner a false one.) After a restart what was refused stays refused.
 
 use super::Agent;
 use super::knowledge::pair_of;
 use super::negotiation::Work;
-use super::promise::{Guess, Signs};
+use super::promise::Guess;
 use super::shortlist::Candidate;
 use super::two_sided;
 use crate::geometry::Relative;
@@ -20,9 +22,12 @@ use std::sync::Arc;
 
 /// Pairs that wait for a second look at most; of more, the least alike go.
 pub const SECOND_LOOKS_MAX: usize = 1_024;
-/// A pair gets a second look if its anchors are no farther apart than this, in units of what both reach: then the two overlap
-/// by most of what either saw.
+/// A pair gets a second look if its anchors are no farther apart than this, at the most that is likely and in units of what
+/// both reach: then the two overlap by most of what either saw.
 const APART_MAX: f64 = 0.3;
+/// What a second look finds may be off by so much from where the map has it, in units of what both reach. Far from where
+/// our map begins its covariances allow more, and places that repeat themselves do so at larger steps, or within one view.
+const OFF_MAX: f64 = 0.1;
 /// What a second look is worth of a first one that promises as much: it is had when there is nothing better to do.
 pub(super) const WORTH: f64 = 0.1;
 
@@ -33,7 +38,7 @@ impl Agent {
             RefusalReason::TooFew | RefusalReason::NoConsensus | RefusalReason::PoorFit => true,
             RefusalReason::Ambiguous | RefusalReason::Degenerate | RefusalReason::BadInput => false,
         };
-        if too_little && !work.further && self.address_of(work.theirs).is_some() {
+        if too_little && work.further.is_none() && self.address_of(work.theirs).is_some() {
             let (mine, theirs, similarity) = (work.mine, work.theirs, guess.signs.similarity);
             let candidate = Candidate { mine, theirs, similarity, wished: false, further: true };
             self.negotiation.add_second_look(candidate);
@@ -41,31 +46,41 @@ impl Agent {
     }
 
     /// Whether a pair that was refused is to be found all the same, by a map that holds both.
-    pub(super) fn calls_for_second_look(&self, candidate: &Candidate, signs: &Signs) -> bool {
-        let is_in_reach = |address: &Hash| !self.negotiation.out_of_reach.contains(address);
-        signs.apart.is_some_and(|apart| apart <= APART_MAX)
-            && self.address_of(candidate.theirs).as_ref().is_some_and(is_in_reach)
+    pub(super) fn calls_for_second_look(&self, candidate: &Candidate) -> bool {
+        let (mine, theirs) = (candidate.mine, candidate.theirs);
+        let goes_on = self.address_of(theirs).is_some();
+        let apart = self.apart_at_most(pair_of(mine, theirs));
+        let is_lost = |id| self.is_further_out_of_reach(id);
+        goes_on && apart.is_some_and(|apart| apart <= APART_MAX) && !is_lost(theirs) && !is_lost(mine)
     }
 
-    /// What a second look found is what the map has it to be, within what the two leave open (χ², 99.9 %). What the anchors'
-    /// errors have in common is not taken off, so that nothing true is refused for it.
-    pub(super) fn agrees_with_map(&self, work: &Work, t_mine_theirs: &Relative) -> bool {
-        let anchors = self.anchor(work.mine).zip(self.anchor(work.theirs));
-        anchors.is_some_and(|(mine, theirs)| two_sided::agree(&mine.inverse().compose(theirs), t_mine_theirs))
+    /// Nobody in reach has the submap's further keypoints.
+    fn is_further_out_of_reach(&self, id: SubmapId) -> bool {
+        self.address_of(id).is_some_and(|address| self.negotiation.out_of_reach.contains(&address))
+    }
+
+    /// Whether what was found may stand: what a second look found is where the map has it. `None` if the map does not hold
+    /// both.
+    pub(super) fn agrees_with_map(&self, work: &Work, t_mine_theirs: &Relative) -> Option<bool> {
+        if work.further.is_none() {
+            return Some(true);
+        }
+        let expected = self.anchor(work.mine)?.inverse().compose(self.anchor(work.theirs)?);
+        let reach = self.reach(work.mine) + expected.sim().scale * self.reach(work.theirs);
+        Some(is_where_expected(&expected, t_mine_theirs, reach))
     }
 
     /// The blobs that an alignment of ours was computed from, of which one tells that further keypoints were looked at.
     pub(super) fn blobs_used(&self, work: &Work) -> Option<[Hash; 2]> {
         let blob = |id| self.knowledge.submap(id).map(|fact| fact.blob);
-        let further = self.address_of(work.theirs).filter(|_| work.further);
-        let (mine, theirs) = (blob(work.mine)?, further.or(blob(work.theirs))?);
+        let (mine, theirs) = (blob(work.mine)?, work.further.or(blob(work.theirs))?);
         Some(if pair_of(work.mine, work.theirs).0 == work.mine { [mine, theirs] } else { [theirs, mine] })
     }
 
     /// Whether another's alignment of our submap was computed from its further keypoints too, so that we look with theirs;
-    /// `None` if it names other blobs than those that the owners stated. Where our map does not connect the two, what we say
-    /// is what a first look says.
-    pub(super) fn is_second_look(&self, fact: &AlignmentFact, mine: SubmapId, theirs: SubmapId) -> Option<bool> {
+    /// `None` if it names other blobs than those that the owners stated.
+    pub(super) fn is_second_look(&self, fact: &AlignmentFact) -> Option<bool> {
+        let (mine, theirs) = self.ours_first(fact);
         let blob = |id| self.knowledge.submap(id).map(|submap| submap.blob);
         let [used_i, used_j] = fact.blobs;
         let (of_mine, of_theirs) = if fact.i == mine { (used_i, used_j) } else { (used_j, used_i) };
@@ -73,7 +88,20 @@ impl Agent {
             return None;
         }
         let is_further = self.address_of(mine) == Some(of_mine);
-        (is_further || blob(mine) == Some(of_mine)).then(|| is_further && self.are_connected(mine, theirs))
+        (is_further || blob(mine) == Some(of_mine)).then_some(is_further)
+    }
+
+    /// Whether another's alignment can be answered now: a second look, once our map holds both submaps, and unless nobody in
+    /// reach has their further keypoints. What cannot be looked at is not refused.
+    pub(super) fn may_look_again_at(&self, fact: &AlignmentFact) -> bool {
+        let (mine, theirs) = self.ours_first(fact);
+        self.is_second_look(fact) != Some(true)
+            || (self.are_connected(mine, theirs) && !self.is_further_out_of_reach(theirs))
+    }
+
+    /// The two submaps of another's alignment of one of ours.
+    pub(super) fn ours_first(&self, fact: &AlignmentFact) -> (SubmapId, SubmapId) {
+        if fact.i.frame.robot == self.me.robot { (fact.i, fact.j) } else { (fact.j, fact.i) }
     }
 
     /// Where a submap's keypoints go on, if they do and those that say so are here.
@@ -96,14 +124,41 @@ impl Agent {
         blobs.into_iter().flat_map(|blob| [Some(blob), further(blob)]).flatten().collect()
     }
 
-    /// The keypoints of a submap, with the further ones if these are wanted and to be had. `None` until they are here.
-    pub(super) fn keypoints_of(&mut self, submap: SubmapId, further: bool) -> Option<Arc<Keypoints>> {
+    /// The keypoints of a submap, with the further ones if these are wanted and there are any, and then their address.
+    /// `None` until they are here.
+    pub(super) fn keypoints_of(&mut self, submap: SubmapId, further: bool) -> Option<(Arc<Keypoints>, Option<Hash>)> {
         let blob = self.knowledge.submap(submap)?.blob;
         let first = self.keypoints_at(blob, submap)?;
-        let address = first.further().filter(|address| further && !self.negotiation.out_of_reach.contains(address));
-        let Some(address) = address else { return Some(first) };
+        let Some(address) = first.further().filter(|_| further) else { return Some((first, None)) };
         let more = self.keypoints_at(address, submap)?;
         // Whoever names what does not fit is looked at as if he had named nothing.
-        Some(first.with_further(&more).map_or(first, Arc::new))
+        Some(first.with_further(&more).map_or((first, None), |both| (Arc::new(both), Some(address))))
+    }
+}
+
+/// Whether a relative pose is the one expected, within what the two leave open (χ², 99.9 %) and within [`OFF_MAX`]. What the
+/// anchors' errors have in common is not taken off, so that nothing true is refused for it.
+fn is_where_expected(expected: &Relative, found: &Relative, reach: f64) -> bool {
+    let off = (expected.sim().translation - found.sim().translation).norm();
+    off <= OFF_MAX * reach && two_sided::agree(expected, found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+    use nalgebra::Vector3;
+
+    /// A map that is sure of little lets a repetition of the place pass by its covariance, and not by its distance.
+    #[test]
+    fn what_is_found_lies_where_it_was_expected() {
+        let at = |x: f64, sigma: f64| {
+            let pose = Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0));
+            let covariance = Covariance::from_sigmas([sigma, sigma, sigma, 0.02, 0.02, 0.02]).unwrap();
+            Relative::Metric(PoseWithCovariance { pose, covariance })
+        };
+        let is = |sigma: f64, off: f64| is_where_expected(&at(2.0, sigma), &at(2.0 + off, 0.05), 40.0);
+        assert!(is(8.0, 0.0) && is(8.0, 3.99) && !is(8.0, 4.01) && !is(8.0, 10.0));
+        assert!(is(0.1, 0.5) && !is(0.1, 0.6), "χ², 99.9 %, of 0.11 m");
     }
 }

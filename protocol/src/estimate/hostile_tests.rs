@@ -109,14 +109,15 @@ fn any_problem() -> impl Strategy<Value = MapProblem> {
     });
     let positions = prop::collection::vec(seen, 0..5);
     let share = prop_oneof![4 => 0.0..1.0, 1 => any::<f64>()];
-    let common = prop::collection::btree_map(entry, share, 0..10);
+    let common = prop::collection::btree_map(entry.clone(), share, 0..10);
+    let second_looks = prop::collection::btree_set(entry, 0..10);
     let two = (0..4u8, 0..4u8).prop_map(|(a, b)| (frame(a.min(b)), frame(a.max(b))));
     let ambiguous = prop::collection::btree_map(two, prop_oneof![0..9usize, Just(usize::MAX)], 0..4);
     let keyframes = prop::collection::btree_map(id(), (1..9u16).prop_filter_map("none", NonZero::new), 0..10);
     let gone = prop::collection::btree_map(id(), prop_oneof![0..9u32, Just(u32::MAX)], 0..10);
-    let problem = (frames, lists, positions, (common, keyframes, gone), ambiguous);
-    problem.prop_map(|(frames, (alignments, sightings), positions, (common, keyframes, gone), ambiguous)| MapProblem {
-        ambiguous,
+    let problem = (frames, lists, positions, (common, keyframes, gone), (ambiguous, second_looks));
+    problem.prop_map(|(frames, (alignments, sightings), positions, (common, keyframes, gone), told)| MapProblem {
+        ambiguous: told.0,
         frames,
         alignments,
         sightings,
@@ -124,6 +125,7 @@ fn any_problem() -> impl Strategy<Value = MapProblem> {
         common,
         keyframes,
         gone,
+        second_looks: told.1,
     })
 }
 

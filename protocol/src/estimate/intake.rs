@@ -85,9 +85,13 @@ impl Intake {
             let unused = intake.refusal(kind, &measurement, &mut entries, &mut submaps);
             let stated = if kind == Kind::Alignment { problem.common.get(&measurement.entry) } else { None };
             let common = distortion::bounded(stated.copied().unwrap_or(0.0));
-            intake.edges.push(EdgeEstimate { common, unused, ..edge });
+            let second_look = kind == Kind::Alignment && problem.second_looks.contains(&measurement.entry);
+            intake.edges.push(EdgeEstimate { common, second_look, unused, ..edge });
         }
         distortion::charge(&mut intake.edges);
+        for edge in intake.edges.iter_mut().filter(|edge| edge.second_look && edge.is_used()) {
+            edge.refuse(Unused::Waiting);
+        }
         for edge in &mut intake.edges {
             edge.weight = if edge.is_used() { edge.weight_at(1.0) } else { 0.0 };
         }
@@ -197,23 +201,26 @@ impl Intake {
         any
     }
 
-    /// Groups frames by the alignments that count: each frame with a number shared by its group.
+    /// Groups frames by the alignments that merge them: each frame with a number shared by its group.
     pub(super) fn groups(&self) -> BTreeMap<FrameId, usize> {
         let place: BTreeMap<FrameId, usize> = self.chains.keys().enumerate().map(|(k, &f)| (f, k)).collect();
         let mut sets = Disjoint::new(place.len());
-        for edge in self.edges.iter().filter(|e| e.kind == Kind::Alignment && e.unused.is_none()) {
+        for edge in self.edges.iter().filter(|e| e.merges()) {
             sets.join(place[&edge.measurement.i.frame], place[&edge.measurement.j.frame]);
         }
         place.into_iter().map(|(f, k)| (f, sets.root(k))).collect()
     }
 
-    /// Sets aside sightings between frames that alignments do not merge: sightings alone never do.
-    pub(super) fn drop_stray_sightings(&mut self) {
+    /// Sets aside what lies between frames that nothing merges any more: neither sightings nor second looks ever do.
+    pub(super) fn drop_strays(&mut self) {
         let groups = self.groups();
         let stray = |e: &&mut EdgeEstimate| {
             e.unused.is_none() && groups.get(&e.measurement.i.frame) != groups.get(&e.measurement.j.frame)
         };
-        self.edges.iter_mut().filter(stray).for_each(|e| e.refuse(Unused::Unmerged(PairStatus::Provisional)));
+        for edge in self.edges.iter_mut().filter(stray) {
+            let is_alignment = edge.kind == Kind::Alignment;
+            edge.refuse(if is_alignment { Unused::Waiting } else { Unused::Unmerged(PairStatus::Provisional) });
+        }
     }
 
     /// Lets in the sightings and waiting alignments that agree with the map so far, the latter with the standard

@@ -79,6 +79,9 @@ pub struct MapProblem {
     /// Between two frames, `a < b`: pairs of submaps of which one end found an alignment, and the other end that there are
     /// several. Within one, `a = b`: pairs of its owner's that fit in several ways. Places that repeat themselves show by it.
     pub ambiguous: BTreeMap<(FrameId, FrameId), usize>,
+    /// Alignments that were looked for because a map had their submaps overlap: they speak for no map, and count once one
+    /// without them agrees with them.
+    pub second_looks: BTreeSet<EntryId>,
 }
 
 /// Why a measurement does not count.
@@ -111,7 +114,7 @@ pub enum Unused {
     /// Its two frames are not merged.
     #[error("its frames are not merged ({0:?})")]
     Unmerged(PairStatus),
-    /// Its pair has more alignments than its consensus weighs; it counts once the map agrees with it.
+    /// Its pair has more alignments than its consensus weighs, or a map called for it; it counts once the map agrees with it.
     #[error("waits for a map that tells where its frames lie")]
     Waiting,
     /// The frame-level consensus of its pair leaves it out.
@@ -152,6 +155,8 @@ pub struct EdgeEstimate {
     pub(super) charges: Charges,
     /// Of a position, what was seen.
     pub(super) point: Option<SeenPoint>,
+    /// A map called for it: it merges nothing.
+    pub(super) second_look: bool,
     /// Why it does not count; `None` if it does.
     pub unused: Option<Unused>,
 }
@@ -281,7 +286,7 @@ impl Map {
                 return Self { solutions, start };
             }
             pairs::demote(intake, pairs, config.alignments_min);
-            intake.drop_stray_sightings();
+            intake.drop_strays();
             round += 1;
         }
     }
@@ -327,7 +332,16 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
 
 impl EdgeEstimate {
     pub(super) fn new(kind: Kind, measurement: AgreedAlignment) -> Self {
-        Self { kind, measurement, weight: 0.0, common: 0.0, charges: Charges::default(), point: None, unused: None }
+        Self {
+            kind,
+            measurement,
+            weight: 0.0,
+            common: 0.0,
+            charges: Charges::default(),
+            point: None,
+            second_look: false,
+            unused: None,
+        }
     }
 
     pub(super) fn factor(&self) -> Factor {
@@ -343,6 +357,11 @@ impl EdgeEstimate {
     /// `t_i_j`, one of several between its two frames that are taken as independent.
     pub(super) fn among_others(&self) -> Relative {
         self.measurement.t_i_j.widened(self.charges.between.sqrt())
+    }
+
+    /// Whether it merges its frames.
+    pub(super) fn merges(&self) -> bool {
+        self.kind == Kind::Alignment && !self.second_look && self.is_used()
     }
 
     /// Whether it counts in the joint estimate.

@@ -1,6 +1,8 @@
 //! The whole map: truth, calibration, order, false alignments, and hostile sets of facts.
 
+use super::intake::Intake;
 use super::joint::*;
+use super::pairs;
 use super::solve::SolveError;
 use super::test_graphs::*;
 use super::test_world::*;
@@ -309,24 +311,27 @@ fn a_frame_that_takes_its_places_for_others_merges_with_none() {
     let (merged, ambiguous) = ((PairStatus::Merged, 5), (PairStatus::Ambiguous, 0));
     // Closures of the first frame: as found at the same place, though the way between is long; true; and off by a share of
     // the way, as where odometry is worse than it says.
-    let status_told = |told: usize, elsewhere: usize, held: usize, drifted: usize| {
+    let status_of = |told: usize, elsewhere: usize, held: usize, drifted: usize, again: bool| {
         let ambiguous = BTreeMap::from([((frame(0), frame(0)), told)]);
         let mut problem = MapProblem { ambiguous, ..world.problem.clone() };
         let mut close = |k: usize, t_i_j: Se3| {
             let t_i_j = Relative::Metric(PoseWithCovariance { pose: t_i_j, covariance: sigmas(0.02, 0.005) });
             let entry = EntryId { frame: frame(0), seq: 1000 + problem.alignments.len() as u32 };
             problem.alignments.push(AgreedAlignment { entry, i: submap(0, k), j: submap(0, k + 6), t_i_j });
+            entry
         };
         let truth = |k: usize| world.truth[&submap(0, k)].inverse() * world.truth[&submap(0, k + 6)];
-        (0..elsewhere).for_each(|k| close(k, Se3::identity()));
-        (elsewhere..elsewhere + held).for_each(|k| close(k, truth(k)));
+        (0..elsewhere).for_each(|k| _ = close(k, Se3::identity()));
+        let true_ones: Vec<EntryId> = (elsewhere..elsewhere + held).map(|k| close(k, truth(k))).collect();
         let off = |k| truth(k) * Se3::new(Se3::identity().rotation, Vector3::new(0.5, 0.0, 0.0));
-        (elsewhere + held..elsewhere + held + drifted).for_each(|k| close(k, off(k)));
+        (elsewhere + held..elsewhere + held + drifted).for_each(|k| _ = close(k, off(k)));
+        problem.second_looks = true_ones.into_iter().filter(|_| again).collect();
         let map = solve_map(&problem, &EstimateConfig::default());
         let refused = map.edges().iter().filter(|e| matches!(e.unused, Some(Unused::Odometry(_)))).count();
         assert_eq!(refused, elsewhere + drifted);
         map.pairs().iter().map(|pair| (pair.status, pair.used)).collect::<Vec<_>>()
     };
+    let status_told = |told, elsewhere, held, drifted| status_of(told, elsewhere, held, drifted, false);
     let status = |elsewhere, held, drifted| status_told(0, elsewhere, held, drifted);
     assert_eq!(status(0, 0, 0), [merged; 3]);
     assert_eq!(status(1, 0, 0), [merged; 3], "one may be chance");
@@ -339,6 +344,65 @@ fn a_frame_that_takes_its_places_for_others_merges_with_none() {
     assert_eq!(status(2, 0, 0), [ambiguous, ambiguous, merged]);
     assert_eq!(status(2, 3, 0), [merged; 3], "most were right");
     assert_eq!(status(0, 0, 3), [merged; 3], "no place is taken for another");
+    assert_eq!(status_of(0, 2, 3, 0, true), [ambiguous, ambiguous, merged], "looked for where the odometry had them");
+}
+
+/// What was found where a map expected it is no witness for that map. It makes one surer that others vouch for.
+#[test]
+fn second_looks_merge_nothing_and_count_once_others_have() {
+    let solved = |world: &World, second: &dyn Fn(&AgreedAlignment) -> bool| {
+        let stated = &world.problem.alignments;
+        let second_looks = stated.iter().filter(|one| second(one)).map(|one| one.entry).collect();
+        solve_map(&MapProblem { second_looks, ..world.problem.clone() }, &EstimateConfig::default())
+    };
+    let pairs = |map: &JointEstimate| map.pairs().iter().map(|p| (p.status, p.agreed, p.used)).collect::<Vec<_>>();
+    let between = |one: &AgreedAlignment, a, b| {
+        let (i, j) = (one.i.frame, one.j.frame);
+        (i.min(j), i.max(j)) == (frame(a), frame(b))
+    };
+    let used =
+        |map: &JointEstimate, a, b| map.edges().iter().filter(|e| e.is_used() && between(&e.measurement, a, b)).count();
+    let rng = &mut rng(47);
+    let mut two = World::new(rng, 2, 12, false);
+    two.align(rng, frame(0), frame(1), 5, false);
+    let entries: Vec<EntryId> = two.problem.alignments.iter().map(|one| one.entry).collect();
+    let first = |count: usize| {
+        let first: Vec<EntryId> = entries[..count].to_vec();
+        move |one: &AgreedAlignment| !first.contains(&one.entry)
+    };
+    for (count, expected) in
+        [(5, (PairStatus::Merged, 5, 5)), (3, (PairStatus::Merged, 5, 5)), (2, (PairStatus::Provisional, 5, 0))]
+    {
+        assert_eq!(pairs(&solved(&two, &first(count))), [expected], "{count} at first sight");
+    }
+    let none = solved(&two, &first(0));
+    assert!(none.pairs().is_empty() && none.edges().iter().all(|e| e.unused == Some(Unused::Waiting)));
+    // Through a third frame they count, and go with what ties that.
+    let mut three = World::new(rng, 3, 12, false);
+    three.align_all(rng, 4, false);
+    let of_one_pair = solved(&three, &|one| between(one, 0, 1));
+    assert_eq!((used(&of_one_pair, 0, 1), of_one_pair.pairs().len()), (4, 2));
+    let of_two = solved(&three, &|one| between(one, 0, 1) || between(one, 0, 2));
+    assert_eq!((used(&of_two, 0, 1), used(&of_two, 0, 2), used(&of_two, 1, 2)), (0, 0, 4));
+}
+
+/// A map that let second looks in falls apart as if there were none.
+#[test]
+fn second_looks_do_not_hold_together_what_falls_apart() {
+    let rng = &mut rng(48);
+    let mut world = World::new(rng, 2, 12, false);
+    world.align(rng, frame(0), frame(1), 6, false);
+    let second_looks = world.problem.alignments[3..].iter().map(|one| one.entry).collect();
+    let problem = MapProblem { second_looks, ..world.problem.clone() };
+    let mut intake = Intake::new(&problem);
+    let mut pairs = pairs::consensus(&mut intake, &EstimateConfig::default());
+    intake.edges.iter_mut().for_each(|edge| edge.unused = None);
+    intake.edges[0].refuse(Unused::Contradicts(1e3));
+    pairs::demote(&mut intake, &mut pairs, 3);
+    intake.drop_strays();
+    let of = |second: bool| intake.edges.iter().filter(move |e| e.second_look == second).filter_map(|e| e.unused);
+    assert_eq!(of(false).collect::<Vec<_>>(), [Unused::Contradicts(1e3), Unused::TooFew, Unused::TooFew]);
+    assert_eq!(of(true).collect::<Vec<_>>(), [Unused::Waiting; 3]);
 }
 
 /// Two frames in metres that only one of unknown unit ties together: to it they have one and the same scale.

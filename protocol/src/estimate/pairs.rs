@@ -6,7 +6,7 @@
 //! false merge is worse than a missing one.
 
 use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
-use super::intake::{Chain, Intake, Kind};
+use super::intake::{Chain, Intake};
 use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
 use super::loops::{self, Loops};
 use super::marginals::is_rigid;
@@ -37,6 +37,8 @@ pub(super) struct Pair {
     members: Vec<usize>,
     /// Those among them that the consensus weighed.
     weighed: Vec<usize>,
+    /// What a second look found is judged by the map.
+    second_looks: Vec<usize>,
     outcome: Outcome,
     contradicts_loop: bool,
     /// Part of the spanning forest.
@@ -60,13 +62,19 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
     let loops = loops::gate(intake);
     let repeat = repeating(&loops, &intake.ambiguous);
     let mut members: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
+    let mut second: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
     for (k, edge) in intake.edges.iter().enumerate() {
         let (i, j) = (edge.measurement.i.frame, edge.measurement.j.frame);
-        if edge.kind == Kind::Alignment && edge.unused.is_none() && i != j {
-            members.entry((i.min(j), i.max(j))).or_default().push(k);
+        let list = match edge.unused {
+            None if edge.merges() => &mut members,
+            Some(Unused::Waiting) if edge.second_look => &mut second,
+            _ => continue,
+        };
+        if i != j {
+            list.entry((i.min(j), i.max(j))).or_default().push(k);
         }
     }
-    let pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
+    let mut pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
         let weighed = weighed(intake, (a, b), &members, config);
         let outcome = decide(intake, (a, b), &weighed, config);
         let ambiguous = intake.ambiguous.get(&(a, b)).copied().unwrap_or(0);
@@ -75,9 +83,10 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
         } else {
             outcome.unless_ambiguous(ambiguous, members.len())
         };
-        Pair { a, b, members, weighed, outcome, contradicts_loop: false, in_tree: false }
+        let second_looks = second.remove(&(a, b)).unwrap_or_default();
+        Pair { a, b, members, weighed, second_looks, outcome, contradicts_loop: false, in_tree: false }
     };
-    let mut pairs: Vec<Pair> = members.into_iter().map(pair).collect();
+    let mut pairs: Vec<Pair> = members.into_iter().map(&mut pair).collect();
     for pair in &pairs {
         pair.mark(intake);
     }
@@ -130,7 +139,7 @@ pub(super) fn start(intake: &Intake, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3>
 /// Undoes merges of which too few alignments survive.
 pub(super) fn demote(intake: &mut Intake, pairs: &mut [Pair], alignments_min: usize) {
     for pair in pairs.iter_mut().filter(|p| p.outcome.status == PairStatus::Merged) {
-        if pair.used(&intake.edges) < alignments_min {
+        if used(&pair.members, &intake.edges) < alignments_min {
             pair.outcome.status = PairStatus::Inconsistent;
             pair.refuse(intake, Unused::TooFew);
         }
@@ -167,22 +176,22 @@ impl Pair {
         }
     }
 
-    fn used(&self, edges: &[EdgeEstimate]) -> usize {
-        self.members.iter().filter(|&&k| edges[k].is_used()).count()
-    }
-
     pub(super) fn estimate(self, map: &JointEstimate) -> PairEstimate {
         PairEstimate {
             a: self.a,
             b: self.b,
             status: self.outcome.status,
-            agreed: self.members.len(),
-            used: self.used(map.edges()),
+            agreed: self.members.len() + self.second_looks.len(),
+            used: used(&self.members, map.edges()) + used(&self.second_looks, map.edges()),
             log10_nfa: self.outcome.log10_nfa,
             t_a_b: map.frame(self.a, self.b).or(self.outcome.t_a_b),
             contradicts_loop: self.contradicts_loop,
         }
     }
+}
+
+fn used(of: &[usize], edges: &[EdgeEstimate]) -> usize {
+    of.iter().filter(|&&k| edges[k].is_used()).count()
 }
 
 /// At most [`WEIGHED_MAX`] of a pair's alignments: the most promising where units are equal, else evenly from first to

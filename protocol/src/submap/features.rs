@@ -97,7 +97,8 @@ impl Keypoints {
         self.further
     }
 
-    /// These and further ones; `None` if those are not of the same submap.
+    /// These and further ones; `None` if those cannot be of the same submap. (That they are is their owner's word, who signed
+    /// the address of the blob that names theirs.)
     pub fn with_further(&self, further: &Self) -> Option<Self> {
         let landmarks = match (&self.landmarks, &further.landmarks) {
             (None, None) => None,

@@ -130,6 +130,9 @@ fn gaussian(rng: &mut ChaCha8Rng) -> f64 {
     (0..12).map(|_| rng.random_range(0.0..1.0)).sum::<f64>() - 6.0
 }
 
+/// Whether an answer never comes: to whom, and which.
+type Lost = Box<dyn Fn(usize, &[u8]) -> bool>;
+
 type Answers = Box<dyn Fn(&AlignJob) -> Option<Result<Box<Measured>, NotAligned>>>;
 
 /// Agents on perfect wires: everything is delivered at once, every record is durable at once.
@@ -145,6 +148,8 @@ pub struct Wires {
     pub pieces: Vec<(usize, Instant, Option<Vec<u8>>)>,
     /// What a look at a pair comes to, if it is not to be run.
     pub answers: Answers,
+    /// Which answers are lost.
+    pub lost: Lost,
     inbox: VecDeque<(usize, Input)>,
 }
 
@@ -160,6 +165,7 @@ impl Wires {
             published: Vec::new(),
             pieces: Vec::new(),
             answers: Box::new(|_| None),
+            lost: Box::new(|_, _| false),
             inbox: VecDeque::new(),
         };
         for a in 0..wires.agents.len() {
@@ -233,6 +239,7 @@ impl Wires {
                     }
                     answer.expect("every question is answered at once")
                 });
+                let answer = answer.filter(|bytes| !(self.lost)(k, bytes));
                 if kind == QueryKind::Blob {
                     self.pieces.push((k, self.now, answer.clone()));
                 }

@@ -17,9 +17,18 @@ use std::time::Duration;
 
 /// Two robots on a circle, of whom the second saw what the first did; every look is answered so.
 fn driven(answers: impl Fn(&AlignJob) -> Option<Result<Box<Measured>, NotAligned>> + 'static) -> Wires {
+    driven_without(answers, |_, _| false)
+}
+
+/// The same, where answers are lost.
+fn driven_without(
+    answers: impl Fn(&AlignJob) -> Option<Result<Box<Measured>, NotAligned>> + 'static,
+    lost: impl Fn(usize, &[u8]) -> bool + 'static,
+) -> Wires {
     let world = World::new(1);
     let mut wires = Wires::new((0..2).map(|k| agent_of(k, &config())).collect());
     wires.answers = Box::new(answers);
+    wires.lost = Box::new(lost);
     let runs: Vec<_> = (0..2).map(|k| drive(&world, k, 50).0).collect();
     for n in 0..50 {
         for (k, keyframes) in runs.iter().enumerate() {
@@ -132,6 +141,38 @@ fn what_should_have_been_found_is_looked_at_again_by_both_ends() {
         fetched.len()
     );
     assert!(wires.agents.iter().all(|agent| agent.status().idle && agent.status().merged_with.len() == 1));
+}
+
+/// The second robot gets no further keypoints: it leaves open what it cannot look at, and answers once it can.
+#[test]
+fn what_cannot_be_looked_at_again_yet_is_not_refused() {
+    let is_further = |bytes: &[u8]| match Message::decode(bytes) {
+        Ok(Message::BlobReply { bytes, .. }) => Keypoints::address_in(&bytes).is_none(),
+        _ => false,
+    };
+    let mut wires = driven_without(some_refused, move |to, bytes| to == 1 && is_further(bytes));
+    let answers = |wires: &Wires| {
+        let facts = facts(wires);
+        let verdicts = |alignment: EntryId| {
+            facts.values().find_map(move |fact| match fact {
+                Fact::Verdict(verdict) if verdict.alignment == alignment => Some(verdict.outcome.clone()),
+                _ => None,
+            })
+        };
+        let between = further_used(wires).into_iter().filter(|(_, fact)| fact.i.frame != fact.j.frame);
+        between.map(|(id, _)| (id.frame.robot, verdicts(id))).collect::<Vec<_>>()
+    };
+    let stated = answers(&wires);
+    assert!(!stated.is_empty() && stated.iter().all(|(by, answer)| *by == robot(0) && answer.is_none()), "{stated:?}");
+    assert!(wires.agents.iter().all(|agent| agent.status().idle), "what waits is no work");
+    wires.lost = Box::new(|_, _| false);
+    for up in [false, true] {
+        wires.input(1, Input::Neighbour { robot: robot(0), up });
+    }
+    wires.run(Duration::from_secs(60));
+    let answered = answers(&wires);
+    assert!(answered.len() >= stated.len());
+    assert!(answered.iter().all(|(_, a)| matches!(a, Some(VerdictOutcome::Measured { .. }))), "{answered:?}");
 }
 
 #[test]

@@ -64,6 +64,7 @@ pub fn config() -> Config {
     config.submap.keyframes_max = 2;
     config.submap.points_max = 100;
     config.submap.keypoints = 16;
+    config.submap.keypoints_further = 16;
     config.align.support_min = 3.0;
     config.align.fit_min = 0.0;
     config.align.jobs_max = 1;

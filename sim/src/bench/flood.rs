@@ -101,6 +101,7 @@ fn scenario(robots: usize, flooded: bool) -> Scenario {
     config.submap.distance_m = 1e3;
     config.submap.rotation_deg = 180.0;
     config.submap.keypoints = 16;
+    config.submap.keypoints_further = 16;
     config.align.candidates_max = 24;
     let mut scenario = Scenario {
         landmarks: None,

@@ -78,6 +78,11 @@ impl StandIn {
         }
         // Whoever looks, and in whatever order: what both ends find is the same, or their mean would err by less than it says.
         let (first, second) = (mine.features.min(theirs.features), mine.features.max(theirs.features));
+        let is_first_look = job.theirs.further().is_some();
+        let mut shy = Dice::new(self.seed, &format!("at first {first} {second}"));
+        if is_first_look && shy.chance(self.options.refused_at_first) {
+            return Err(RefusalReason::NoConsensus);
+        }
         let mut dice = Dice::new(self.seed, &format!("align {first} {second}"));
         let side = if mine.features == first { 1.0 } else { -1.0 };
         let [t, r] = self.options.sigma;
@@ -127,7 +132,7 @@ mod tests {
 
     /// Describes a scan of so many points on a wall, made at `x`.
     fn described(standin: &mut StandIn, points: usize, x: f64) -> Described {
-        let config = SubmapConfig::default();
+        let config = SubmapConfig { keypoints: 16, keypoints_further: 16, ..SubmapConfig::default() };
         let mut builder = SubmapBuilder::new(config.clone());
         let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
         let pose = PoseWithCovariance { pose: Se3::identity(), covariance };
@@ -195,6 +200,21 @@ mod tests {
         let truth = Se3::new(Se3::identity().rotation, [2.0, 0.0, 0.0].into());
         let (apart, off) = ((there * back).log().norm(), truth.local(&there).norm());
         assert!(off > 0.005 && apart < 0.05 * off, "{apart} apart, {off} off");
+    }
+
+    /// By both ends, and found by both with further keypoints.
+    #[test]
+    fn what_is_refused_at_first_is_found_at_a_second_look() {
+        let options = SummaryOptions { refused_at_first: 1.0, ..SummaryOptions::default() };
+        let mut standin = StandIn::new(options, 1);
+        let [one, other] = [0.0, 2.0].map(|x| described(&mut standin, 400, x));
+        assert!(matches!(align(&mut standin, &one, &other, 1), Err(RefusalReason::NoConsensus)));
+        assert!(matches!(align(&mut standin, &other, &one, 1), Err(RefusalReason::NoConsensus)));
+        let [one, other] = [one, other].map(|described| {
+            let keypoints = described.keypoints.with_further(&described.further.unwrap()).unwrap();
+            Described { keypoints, further: None, ..described }
+        });
+        assert!(align(&mut standin, &one, &other, 1).is_ok() && align(&mut standin, &other, &one, 1).is_ok());
     }
 
     #[test]

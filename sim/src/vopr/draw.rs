@@ -25,6 +25,8 @@ const MOVING_SHARE: f64 = 0.5;
 const IN_REACH: f64 = 12.0;
 /// Share of the runs in which robots also align, merge and solve.
 const SOLVE_SHARE: f64 = 0.15;
+/// Share of the pairs that align which a first look refuses.
+const REFUSED_AT_FIRST: f64 = 0.15;
 /// Share of the runs in which robots may send little, and how little, B/s; in a crowd as much more as there are more of
 /// them, for everybody's facts cross every link, and within the stated time they must be able to.
 const SLOW_LINK_SHARE: f64 = 0.25;
@@ -73,7 +75,8 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
     };
     scenario.machine.start_within_secs = scenario.machine.start_within_secs.min(0.3 * duration_secs);
     let liars = if solve { liars(&scenario, &mut dice) } else { Vec::new() };
-    scenario.summary = Some(SummaryOptions { solve, liars, ..SummaryOptions::default() });
+    let summary = SummaryOptions { solve, liars, refused_at_first: REFUSED_AT_FIRST, ..SummaryOptions::default() };
+    scenario.summary = Some(summary);
     let split_secs = split_secs(robots, &mut Dice::new(seed, "vopr long"));
     if let Some(split_secs) = split_secs {
         slow_down(&mut scenario, split_secs);
@@ -161,6 +164,7 @@ fn config(robots: usize, dice: &mut Dice) -> Config {
     config.submap.distance_m = 1e3;
     config.submap.rotation_deg = 180.0;
     config.submap.keypoints = 16;
+    config.submap.keypoints_further = 16;
     // Few tries: runs are about facts, and must have an end.
     config.align.candidates_max = 24;
     config.estimate.interval_secs = dice.range(2.0, 8.0);
