@@ -68,9 +68,16 @@ impl Agent {
         self.negotiation.wishes.remove((fact.i, fact.j));
         let ours = fact.i.frame.robot == self.me.robot || fact.j.frame.robot == self.me.robot;
         let owed = ours && id.frame.robot != self.me.robot && !self.knowledge.has_verdict(id, self.me.robot);
-        if owed && self.negotiation.verify.len() < VERIFICATIONS_MAX {
-            self.negotiation.verify.insert(id);
+        if owed {
+            self.owe_answer(id);
         }
+    }
+
+    /// Of more than may wait for an answer, one goes that cannot be given now.
+    fn owe_answer(&mut self, id: EntryId) {
+        let is_full = self.negotiation.verify.len() >= VERIFICATIONS_MAX;
+        let now = if is_full { self.answers_owed().into_iter().collect() } else { BTreeSet::new() };
+        self.negotiation.add_verification(id, |id| !now.contains(id));
     }
 
     fn report_agreement(&mut self, alignment: EntryId) {
@@ -366,7 +373,7 @@ impl Agent {
     /// A second look of which our map cannot say any more whether it agrees: an answer that is owed waits until it can.
     fn put_off(&mut self, work: &Work) {
         if let Purpose::Verify(id) = work.purpose {
-            self.negotiation.verify.insert(id);
+            self.owe_answer(id);
         }
     }
 

@@ -226,6 +226,24 @@ impl Negotiation {
         }
     }
 
+    /// Notes an alignment to answer. Beyond [`VERIFICATIONS_MAX`] one goes that `waits`, of the robot with most of these: whoever
+    /// states what cannot be answered must not keep others from their answers.
+    pub fn add_verification(&mut self, id: EntryId, waits: impl Fn(&EntryId) -> bool) {
+        if self.verify.len() >= VERIFICATIONS_MAX {
+            let mut waiting: BTreeMap<RobotId, Vec<EntryId>> = BTreeMap::new();
+            for id in self.verify.iter().filter(|id| waits(id)) {
+                waiting.entry(id.frame.robot).or_default().push(*id);
+            }
+            let last = waiting.into_values().max_by_key(Vec::len).and_then(|ids| ids.last().copied());
+            if let Some(last) = last {
+                self.verify.remove(&last);
+            }
+        }
+        if self.verify.len() < VERIFICATIONS_MAX {
+            self.verify.insert(id);
+        }
+    }
+
     /// Notes a pair that was refused and may be looked at again; the least similar beyond [`SECOND_LOOKS_MAX`] goes.
     pub fn add_second_look(&mut self, candidate: Candidate) {
         self.second_looks.offer(candidate, SECOND_LOOKS_MAX);
@@ -375,6 +393,26 @@ mod tests {
             (waiting(&n).len(), n.tries(&best)),
             (SECOND_LOOKS_MAX - 1, 0),
             "it takes no first look from others"
+        );
+    }
+
+    #[test]
+    fn who_states_what_cannot_be_answered_keeps_nobody_from_an_answer() {
+        let mut n = Negotiation::new(Sensor::Points3d);
+        let of = |robot: u8, seq: u32| EntryId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 1 }, seq };
+        let held = |n: &Negotiation, robot: u8| n.verify.iter().filter(|id| id.frame.robot.0[0] == robot).count();
+        let waits = |id: &EntryId| id.frame.robot.0[0] != 3;
+        (0..4).for_each(|seq| n.add_verification(of(1, seq), waits));
+        (0..VERIFICATIONS_MAX as u32).for_each(|seq| n.add_verification(of(2, seq), waits));
+        assert_eq!((held(&n, 1), held(&n, 2)), (4, VERIFICATIONS_MAX - 4), "the one with most gives way to itself");
+        (0..VERIFICATIONS_MAX as u32 - 4).for_each(|seq| n.add_verification(of(3, seq), waits));
+        assert_eq!((n.verify.len(), held(&n, 3)), (VERIFICATIONS_MAX, VERIFICATIONS_MAX - 4));
+        assert_eq!((held(&n, 1), held(&n, 2)), (2, 2));
+        (0..5).for_each(|seq| n.add_verification(of(3, 5_000 + seq), waits));
+        assert_eq!(
+            (n.verify.len(), held(&n, 3)),
+            (VERIFICATIONS_MAX, VERIFICATIONS_MAX),
+            "none goes that can be answered"
         );
     }
 
