@@ -177,7 +177,7 @@ impl Agent {
         let reachable = |id: &&EntryId| {
             let fact = self.knowledge.alignment(**id);
             fact.is_none_or(|fact| {
-                !self.is_out_of_reach(fact.i) && !self.is_out_of_reach(fact.j) && self.may_look_again_at(fact)
+                !self.is_out_of_reach(fact.i) && !self.is_out_of_reach(fact.j) && self.may_be_judged(fact)
             })
         };
         self.negotiation.verify.iter().filter(reachable).copied().collect()
@@ -349,7 +349,8 @@ impl Agent {
     /// submap speaks for a whole frame. Of submaps of another epoch nothing is told.
     fn note_lookalike(&mut self, work: &Work, why: NotAligned) {
         let ((i, j), frame) = (pair_of(work.mine, work.theirs), self.me.frame);
-        let is_of_ours = i.frame == frame && j.frame == frame;
+        // Second looks speak for no merge, and against none.
+        let is_of_ours = i.frame == frame && j.frame == frame && work.further.is_none();
         if !why.elsewhere || !is_of_ours {
             return;
         }

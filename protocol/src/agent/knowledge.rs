@@ -231,7 +231,7 @@ impl Knowledge {
     }
 
     /// Whether an alignment names other blobs than its submaps' own facts do: it was computed from further keypoints.
-    fn is_second_look(&self, fact: &AlignmentFact) -> bool {
+    pub(super) fn is_second_look(&self, fact: &AlignmentFact) -> bool {
         let stated = |id: SubmapId| self.submap(id).map(|known| known.blob);
         [stated(fact.i), stated(fact.j)] != fact.blobs.map(Some)
     }
@@ -344,7 +344,8 @@ impl Knowledge {
     /// several; how many. Of a frame and itself, pairs that fit in several ways by their owner's word.
     fn ambiguous(&self) -> BTreeMap<(FrameId, FrameId), usize> {
         let is_ambiguous = |id: &EntryId| {
-            let verdict = self.alignments.get(id).and_then(|fact| self.verdict(*id, fact));
+            let first_look = self.alignments.get(id).filter(|fact| !self.is_second_look(fact));
+            let verdict = first_look.and_then(|fact| self.verdict(*id, fact));
             verdict.is_some_and(|v| v.outcome == VerdictOutcome::Refused(RefusalReason::Ambiguous))
         };
         let mut counts = BTreeMap::new();
@@ -366,9 +367,13 @@ impl Knowledge {
         told.map(|(_, pair)| (pair.i, pair.j)).collect()
     }
 
-    /// Of all alignments of two submaps the one that counts: the first that both endpoints agree on.
+    /// Of all alignments of two submaps the one that counts: the first that both endpoints agree on, of first looks if there
+    /// is one.
     pub fn counted(&self, pair: Pair) -> Option<EntryId> {
-        self.by_pair.get(&pair)?.iter().find(|id| self.agreement(**id) == Agreement::Agreed).copied()
+        let agreed =
+            || self.by_pair.get(&pair).into_iter().flatten().filter(|id| self.agreement(**id) == Agreement::Agreed);
+        let is_first = |id: &&EntryId| self.alignments.get(id).is_some_and(|fact| !self.is_second_look(fact));
+        agreed().find(is_first).or_else(|| agreed().next()).copied()
     }
 
     /// Whether a LiDAR saw the submap, by its owner's word.

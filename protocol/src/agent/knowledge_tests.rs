@@ -79,6 +79,24 @@ fn an_alignment_from_other_keypoints_is_a_second_look() {
     }
 }
 
+/// What a second look is answered speaks for no merge and against none, and it stands for no first look.
+#[test]
+fn first_looks_come_before_second_ones() {
+    let Fact::Alignment(first) = alignment(1, 2, 3.0, 0.02) else { panic!() };
+    let again = AlignmentFact { blobs: [Hash([1; 32]), Hash::default()], ..first.clone() };
+    let refused = |alignment| {
+        let outcome = VerdictOutcome::Refused(RefusalReason::Ambiguous);
+        Fact::Verdict(VerdictFact { alignment, outcome })
+    };
+    let stated = |fact: &AlignmentFact| (entry(1, 1), Fact::Alignment(fact.clone()));
+    let ambiguous = |fact| problem(&knowledge(&[stated(fact), (entry(2, 1), refused(entry(1, 1)))])).ambiguous.len();
+    assert_eq!((ambiguous(&first), ambiguous(&again)), (1, 0));
+    let later = [(entry(1, 2), Fact::Alignment(first.clone())), (entry(2, 2), verdict(entry(1, 2), 3.03, 0.02))];
+    let both = [vec![stated(&again), (entry(2, 1), verdict(entry(1, 1), 3.03, 0.02))], later.to_vec()].concat();
+    let counts = |facts: &[(EntryId, Fact)]| knowledge(facts).counted((anchor(1), anchor(2)));
+    assert_eq!((counts(&both[..2]), counts(&both)), (Some(entry(1, 1)), Some(entry(1, 2))));
+}
+
 #[test]
 fn an_alignment_moves_nothing_until_the_other_endpoint_measured_the_same() {
     let stated = (entry(1, 1), alignment(1, 2, 3.0, 0.02));

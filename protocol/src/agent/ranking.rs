@@ -21,7 +21,7 @@ const NEWS_MIN_FREE: f64 = 0.25;
 /// nothing connects yet always are: a robot that met nobody for long has learned to expect nothing.
 const PROMISE_MIN: f64 = 0.2;
 /// A submap may have drifted from another by so many standard deviations.
-const DRIFT_SIGMAS: f64 = 2.0;
+pub(super) const DRIFT_SIGMAS: f64 = 2.0;
 /// Two LiDAR submaps whose anchors are so far apart, in units of what both reach, tell half of what two at one place do.
 /// *Measured* in a hall: errors' variances are 1.2 times at a fifth, 2.4 at three tenths, 4.2 at four tenths.
 const TOLD_HALF: f64 = 0.23;
@@ -77,7 +77,9 @@ impl Agent {
     fn stated(&self) -> Stated {
         let mut stated = Stated::default();
         for (id, fact) in self.knowledge.alignments() {
-            if self.knowledge.agreement(id) != Agreement::Disputed {
+            // Second looks say nothing where no map holds their submaps.
+            let says = !self.knowledge.is_second_look(fact) || self.are_connected(fact.i, fact.j);
+            if says && self.knowledge.agreement(id) != Agreement::Disputed {
                 stated.count((fact.i, fact.j), &fact.t_i_j);
             }
         }
@@ -141,13 +143,6 @@ impl Agent {
         apart((self.anchor(a)?, self.reach(a)), (self.anchor(b)?, self.reach(b)))
     }
 
-    /// How far they are at the most that is likely, in units of what both reach.
-    pub(super) fn apart_at_most(&self, (a, b): Pair) -> Option<f64> {
-        let (at_a, at_b) = (self.anchor(a)?, self.anchor(b)?);
-        let (apart, drift, reach) = distances((at_a, self.reach(a)), (at_b, self.reach(b)));
-        Some((apart + drift) / reach)
-    }
-
     /// How far from its anchor a submap may still overlap another, in its frame's unit: half its extent.
     pub(super) fn reach(&self, id: SubmapId) -> f64 {
         let [x, y, z] = self.knowledge.submap(id).map_or([0.0; 3], |fact| fact.extent).map(f64::from);
@@ -192,17 +187,12 @@ fn part(of: usize, told: f64) -> usize {
 /// How far two anchors are from one another, at the least that is likely: 0 where they may be at one place, 1 where, as far
 /// as one can tell from their reaches, the submaps just touch. `None` where nothing is known of that, for one has drifted
 /// from the other by more than both reach: such a pair must not be passed over, nor count as near.
-fn apart(a: (&Relative, f64), b: (&Relative, f64)) -> Option<f64> {
-    let (apart, drift, reach) = distances(a, b);
-    let least = (apart - drift).max(0.0);
-    (drift <= reach).then_some(if least == 0.0 { 0.0 } else { least / reach })
-}
-
-/// Of two anchors: their distance, by how much it may be wrong, and what their submaps reach together.
-fn distances((at_a, reach_a): (&Relative, f64), (at_b, reach_b): (&Relative, f64)) -> (f64, f64, f64) {
+fn apart((at_a, reach_a): (&Relative, f64), (at_b, reach_b): (&Relative, f64)) -> Option<f64> {
     let apart = (at_a.sim().translation - at_b.sim().translation).norm();
     let reach = at_a.sim().scale * reach_a + at_b.sim().scale * reach_b;
-    (apart, DRIFT_SIGMAS * drift_between(at_a, at_b), reach)
+    let drift = DRIFT_SIGMAS * drift_between(at_a, at_b);
+    let least = (apart - drift).max(0.0);
+    (drift <= reach).then_some(if least == 0.0 { 0.0 } else { least / reach })
 }
 
 /// The least that the standard deviation of two anchors' distance vector can be, over all axes, in the unit of the frame that

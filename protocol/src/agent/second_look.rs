@@ -11,6 +11,7 @@ use super::Agent;
 use super::knowledge::pair_of;
 use super::negotiation::Work;
 use super::promise::Guess;
+use super::ranking::DRIFT_SIGMAS;
 use super::shortlist::Candidate;
 use super::two_sided;
 use crate::geometry::Relative;
@@ -25,8 +26,8 @@ pub const SECOND_LOOKS_MAX: usize = 1_024;
 /// A pair gets a second look if its anchors are no farther apart than this, at the most that is likely and in units of what
 /// both reach: then the two overlap by most of what either saw.
 const APART_MAX: f64 = 0.3;
-/// What a second look finds may be off by so much from where the map has it, in units of what both reach. Far from where
-/// our map begins its covariances allow more, and places that repeat themselves do so at larger steps, or within one view.
+/// What a second look finds may be off by so much from where the map has it, in units of what both reach. The map's
+/// covariances may allow more, and places that repeat themselves do so at larger steps, or within one view.
 const OFF_MAX: f64 = 0.1;
 /// What a second look is worth of a first one that promises as much: it is had when there is nothing better to do.
 pub(super) const WORTH: f64 = 0.1;
@@ -49,9 +50,16 @@ impl Agent {
     pub(super) fn calls_for_second_look(&self, candidate: &Candidate) -> bool {
         let (mine, theirs) = (candidate.mine, candidate.theirs);
         let goes_on = self.address_of(theirs).is_some();
-        let apart = self.apart_at_most(pair_of(mine, theirs));
+        let is_near = self.expected(mine, theirs).is_some_and(|(t_mine_theirs, reach)| is_near(&t_mine_theirs, reach));
         let is_lost = |id| self.is_further_out_of_reach(id);
-        goes_on && apart.is_some_and(|apart| apart <= APART_MAX) && !is_lost(theirs) && !is_lost(mine)
+        goes_on && is_near && !is_lost(theirs) && !is_lost(mine)
+    }
+
+    /// `t_mine_theirs` by the map, as if its anchors' errors had nothing in common, and what both submaps reach.
+    fn expected(&self, mine: SubmapId, theirs: SubmapId) -> Option<(Relative, f64)> {
+        let t_mine_theirs = self.anchor(mine)?.inverse().compose(self.anchor(theirs)?);
+        let reach = self.reach(mine) + t_mine_theirs.sim().scale * self.reach(theirs);
+        Some((t_mine_theirs, reach))
     }
 
     /// Nobody in reach has the submap's further keypoints.
@@ -65,8 +73,7 @@ impl Agent {
         if work.further.is_none() {
             return Some(true);
         }
-        let expected = self.anchor(work.mine)?.inverse().compose(self.anchor(work.theirs)?);
-        let reach = self.reach(work.mine) + expected.sim().scale * self.reach(work.theirs);
+        let (expected, reach) = self.expected(work.mine, work.theirs)?;
         Some(is_where_expected(&expected, t_mine_theirs, reach))
     }
 
@@ -91,12 +98,14 @@ impl Agent {
         (is_further || blob(mine) == Some(of_mine)).then_some(is_further)
     }
 
-    /// Whether another's alignment can be answered now: a second look, once our map holds both submaps, and unless nobody in
-    /// reach has their further keypoints. What cannot be looked at is not refused.
-    pub(super) fn may_look_again_at(&self, fact: &AlignmentFact) -> bool {
+    /// Whether another's alignment can be judged now: once their submap is known here; a second look, once our map holds both
+    /// submaps, and unless nobody in reach has their further keypoints. What cannot be looked at is not refused.
+    pub(super) fn may_be_judged(&self, fact: &AlignmentFact) -> bool {
         let (mine, theirs) = self.ours_first(fact);
-        self.is_second_look(fact) != Some(true)
-            || (self.are_connected(mine, theirs) && !self.is_further_out_of_reach(theirs))
+        let is_known = self.knowledge.submap(theirs).is_some();
+        let is_second = self.is_second_look(fact) == Some(true);
+        let may_look_again = self.are_connected(mine, theirs) && !self.is_further_out_of_reach(theirs);
+        is_known && (!is_second || may_look_again)
     }
 
     /// The two submaps of another's alignment of one of ours.
@@ -136,6 +145,13 @@ impl Agent {
     }
 }
 
+/// Whether two submaps overlap by most of what either saw, for all that the map leaves open.
+fn is_near(t_mine_theirs: &Relative, reach: f64) -> bool {
+    let sim = t_mine_theirs.sim();
+    let sigma = sim.scale * t_mine_theirs.translation_variance().sqrt();
+    sim.translation.norm() + DRIFT_SIGMAS * sigma <= APART_MAX * reach
+}
+
 /// Whether a relative pose is the one expected, within what the two leave open (χ², 99.9 %) and within [`OFF_MAX`]. What the
 /// anchors' errors have in common is not taken off, so that nothing true is refused for it.
 fn is_where_expected(expected: &Relative, found: &Relative, reach: f64) -> bool {
@@ -148,6 +164,24 @@ mod tests {
     use super::*;
     use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
     use nalgebra::Vector3;
+
+    #[test]
+    fn what_may_lie_elsewhere_by_the_map_is_not_looked_at_again() {
+        let at = |x: f64, sigma: f64| {
+            let pose = Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0));
+            let covariance = Covariance::from_sigmas([sigma, 1e-6, 1e-6, 0.02, 0.02, 0.02]).unwrap();
+            Relative::Metric(PoseWithCovariance { pose, covariance })
+        };
+        let is = |x: f64, sigma: f64| is_near(&at(x, sigma), 40.0);
+        assert!(
+            is(12.0, 0.0)
+                && !is(12.01, 0.001)
+                && is(0.0, 5.999)
+                && !is(0.0, 6.001)
+                && is(6.0, 2.999)
+                && !is(6.0, 3.001)
+        );
+    }
 
     /// A map that is sure of little lets a repetition of the place pass by its covariance, and not by its distance.
     #[test]

@@ -87,7 +87,8 @@ pub(super) fn charge(edges: &mut [EdgeEstimate]) {
         let (i, j) = (edge.measurement.i, edge.measurement.j);
         for (id, other) in [(i, j), (j, i)] {
             *uses.entry(id).or_default() += 1;
-            *uses_between.entry((id, other.frame)).or_default() += 1;
+            // The consensus of frames weighs no second looks.
+            *uses_between.entry((id, other.frame)).or_default() += usize::from(!edge.second_look);
         }
     }
     for edge in edges.iter_mut().filter(|edge| counts(edge)) {

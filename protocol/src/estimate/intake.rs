@@ -86,7 +86,8 @@ impl Intake {
             let stated = if kind == Kind::Alignment { problem.common.get(&measurement.entry) } else { None };
             let common = distortion::bounded(stated.copied().unwrap_or(0.0));
             let second_look = kind == Kind::Alignment && problem.second_looks.contains(&measurement.entry);
-            intake.edges.push(EdgeEstimate { common, second_look, unused, ..edge });
+            let joins = kind == Kind::Alignment && !second_look;
+            intake.edges.push(EdgeEstimate { common, second_look, joins, unused, ..edge });
         }
         distortion::charge(&mut intake.edges);
         for edge in intake.edges.iter_mut().filter(|edge| edge.second_look && edge.is_used()) {
@@ -211,7 +212,8 @@ impl Intake {
         place.into_iter().map(|(f, k)| (f, sets.root(k))).collect()
     }
 
-    /// Sets aside what lies between frames that nothing merges any more: neither sightings nor second looks ever do.
+    /// Sets aside what lies between frames that nothing merges any more: neither sightings nor second looks ever do, nor
+    /// alignments of pairs that did not merge by themselves.
     pub(super) fn drop_strays(&mut self) {
         let groups = self.groups();
         let stray = |e: &&mut EdgeEstimate| {

@@ -155,8 +155,10 @@ pub struct EdgeEstimate {
     pub(super) charges: Charges,
     /// Of a position, what was seen.
     pub(super) point: Option<SeenPoint>,
-    /// A map called for it: it merges nothing.
+    /// A map called for it.
     pub(super) second_look: bool,
+    /// It may hold frames together: it is no second look, and one of a pair that merges.
+    pub(super) joins: bool,
     /// Why it does not count; `None` if it does.
     pub unused: Option<Unused>,
 }
@@ -340,6 +342,7 @@ impl EdgeEstimate {
             charges: Charges::default(),
             point: None,
             second_look: false,
+            joins: kind == Kind::Alignment,
             unused: None,
         }
     }
@@ -359,9 +362,9 @@ impl EdgeEstimate {
         self.measurement.t_i_j.widened(self.charges.between.sqrt())
     }
 
-    /// Whether it merges its frames.
+    /// Whether it holds its frames together.
     pub(super) fn merges(&self) -> bool {
-        self.kind == Kind::Alignment && !self.second_look && self.is_used()
+        self.joins && self.is_used()
     }
 
     /// Whether it counts in the joint estimate.

@@ -386,23 +386,30 @@ fn second_looks_merge_nothing_and_count_once_others_have() {
     assert_eq!((used(&of_two, 0, 1), used(&of_two, 0, 2), used(&of_two, 1, 2)), (0, 0, 4));
 }
 
-/// A map that let second looks in falls apart as if there were none.
+/// A map that let in what merges nothing, second looks and too few first ones, falls apart as if there were none of these.
 #[test]
-fn second_looks_do_not_hold_together_what_falls_apart() {
+fn what_merges_nothing_does_not_hold_together_what_falls_apart() {
     let rng = &mut rng(48);
-    let mut world = World::new(rng, 2, 12, false);
-    world.align(rng, frame(0), frame(1), 6, false);
-    let second_looks = world.problem.alignments[3..].iter().map(|one| one.entry).collect();
+    let mut world = World::new(rng, 3, 12, false);
+    let (a, b, c) = (frame(0), frame(1), frame(2));
+    [(a, c, 3), (b, c, 3), (a, b, 4)].into_iter().for_each(|(x, y, count)| world.align(rng, x, y, count, false));
+    let of_ends = |one: &AgreedAlignment| (one.i.frame.min(one.j.frame), one.i.frame.max(one.j.frame));
+    let between: Vec<EntryId> =
+        world.problem.alignments.iter().filter(|one| of_ends(one) == (a, b)).map(|one| one.entry).collect();
+    let second_looks = between[2..].iter().copied().collect();
     let problem = MapProblem { second_looks, ..world.problem.clone() };
     let mut intake = Intake::new(&problem);
     let mut pairs = pairs::consensus(&mut intake, &EstimateConfig::default());
     intake.edges.iter_mut().for_each(|edge| edge.unused = None);
-    intake.edges[0].refuse(Unused::Contradicts(1e3));
+    intake.edges.iter_mut().find(|e| of_ends(&e.measurement) == (a, c)).unwrap().refuse(Unused::Contradicts(1e3));
     pairs::demote(&mut intake, &mut pairs, 3);
     intake.drop_strays();
-    let of = |second: bool| intake.edges.iter().filter(move |e| e.second_look == second).filter_map(|e| e.unused);
-    assert_eq!(of(false).collect::<Vec<_>>(), [Unused::Contradicts(1e3), Unused::TooFew, Unused::TooFew]);
-    assert_eq!(of(true).collect::<Vec<_>>(), [Unused::Waiting; 3]);
+    let of = |x, y| {
+        let of_pair = intake.edges.iter().filter(move |e| of_ends(&e.measurement) == (x, y));
+        of_pair.map(|e| e.unused).collect::<Vec<_>>()
+    };
+    assert_eq!(of(a, c), [Some(Unused::Contradicts(1e3)), Some(Unused::TooFew), Some(Unused::TooFew)]);
+    assert_eq!((of(b, c), of(a, b)), (vec![None; 3], vec![Some(Unused::Waiting); 4]));
 }
 
 /// Two frames in metres that only one of unknown unit ties together: to it they have one and the same scale.

@@ -151,6 +151,7 @@ impl Pair {
     fn mark(&self, intake: &mut Intake) {
         for &edge in &self.members {
             intake.edges[edge].refuse(Unused::Waiting);
+            intake.edges[edge].joins = self.outcome.status == PairStatus::Merged;
         }
         for (k, &edge) in self.weighed.iter().enumerate() {
             let edge = &mut intake.edges[edge];
@@ -170,7 +171,8 @@ impl Pair {
 
     fn refuse(&self, intake: &mut Intake, reason: Unused) {
         for &k in &self.members {
-            if intake.edges[k].unused.is_none() {
+            intake.edges[k].joins = false;
+            if intake.edges[k].is_used() {
                 intake.edges[k].refuse(reason);
             }
         }
