@@ -73,7 +73,7 @@ impl Agent {
         }
     }
 
-    /// Of more than may wait for an answer, one goes that cannot be given now.
+    /// Of more than may wait for an answer, some go that cannot have one now.
     fn owe_answer(&mut self, id: EntryId) {
         let is_full = self.negotiation.verify.len() >= VERIFICATIONS_MAX;
         let now = if is_full { self.answers_owed().into_iter().collect() } else { BTreeSet::new() };

@@ -16,6 +16,8 @@ pub mod marginals;
 mod minimise;
 pub mod optimality;
 mod pairs;
+#[cfg(test)]
+mod pairs_tests;
 mod places;
 pub mod posegraph;
 pub mod position;
