@@ -12,6 +12,7 @@ pub mod core;
 pub mod dice;
 pub mod faults;
 pub mod field;
+pub mod fingerprint;
 pub mod network;
 pub mod queue;
 pub mod record;

@@ -5,6 +5,7 @@
 use clap::{Parser, Subcommand};
 use merganser_sim::bar::progress_bar;
 use merganser_sim::bench::{self, Bench};
+use merganser_sim::fingerprint::{self, FingerprintArgs};
 use merganser_sim::record::record;
 use merganser_sim::run::{self, RunArgs, load};
 use merganser_sim::scenario::Scenario;
@@ -39,6 +40,8 @@ enum Command {
     Run(RunArgs),
     /// Attack swarms: draw networks, machines and faults from seeds, and check every invariant
     Vopr(VoprArgs),
+    /// Print what scenarios come to, to the bit, and check every invariant
+    Fingerprint(FingerprintArgs),
     /// Write recordings for `merganser demo --data`, the same bytes each time: the demo's three, if not told otherwise
     Record {
         /// Where the recordings' folders go
@@ -74,6 +77,7 @@ fn main() -> ExitCode {
 fn dispatch(command: Command) -> anyhow::Result<bool> {
     match command {
         Command::Vopr(args) => command::run(&args),
+        Command::Fingerprint(args) => fingerprint::run(&args),
         Command::Bench(what) => bench::run(what),
         Command::Record { out, seed, scenario, along } => {
             let scenario = match (scenario, &along) {
