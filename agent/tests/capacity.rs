@@ -42,7 +42,7 @@ impl Drop for Running {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-#[ignore = "a measurement: takes half a minute"]
+#[ignore = "night: a measurement of half a minute"]
 async fn an_agent_holds_the_facts_of_a_hundred_robots() {
     let dir = tempfile::tempdir().unwrap();
     let config = alone_among(dir.path());

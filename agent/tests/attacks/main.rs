@@ -1,9 +1,8 @@
-//! Attacks on the real program over real Zenoh, on loopback: it is killed at any moment, and flooded by strangers. They
-//! take longer than a plain `cargo test` should; how long is for the environment to say:
+//! Attacks on the real program over real Zenoh, on loopback: it is killed at any moment, and flooded by strangers. A plain
+//! `cargo test` runs some of each; how many more is for the environment to say:
 //!
 //! ```sh
-//! MERGANSER_KILLS=500 MERGANSER_FLOOD_SECS=30 \
-//!   cargo test --release -p merganser --test attacks -- --ignored --test-threads=1 --nocapture
+//! MERGANSER_KILLS=500 cargo test --release -p merganser --test attacks -- --ignored --test-threads=1 --nocapture
 //! ```
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 

@@ -27,7 +27,7 @@ use std::time::Duration;
 const SECOND: Duration = Duration::from_secs(1);
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "smoke: root only, in network namespaces of its own"]
 fn a_killed_robot_resumes_and_all_hold_the_same() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     let mut fleet = Fleet::drive(&air, 8.0);
@@ -45,7 +45,7 @@ fn a_killed_robot_resumes_and_all_hold_the_same() {
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_partition_of_twenty_seconds_heals() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     let mut fleet = Fleet::drive(&air, 1.5);
@@ -74,7 +74,7 @@ fn a_partition_of_twenty_seconds_heals() {
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_robot_without_a_radio_for_a_while_catches_up() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     let mut fleet = Fleet::drive(&air, 3.0);
@@ -95,7 +95,7 @@ fn a_robot_without_a_radio_for_a_while_catches_up() {
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn facts_pass_through_a_robot_in_the_middle() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     air.block("alpha", "gamma");
@@ -109,7 +109,7 @@ fn facts_pass_through_a_robot_in_the_middle() {
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_link_that_carries_one_way_only_is_got_around() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     let mut fleet = Fleet::drive(&air, 4.0);
@@ -122,7 +122,7 @@ fn a_link_that_carries_one_way_only_is_got_around() {
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_robot_that_gets_another_address_is_linked_again() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     let mut fleet = Fleet::drive(&air, 3.0);
@@ -138,7 +138,7 @@ fn a_robot_that_gets_another_address_is_linked_again() {
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_robot_that_only_scouts_ends_where_its_address_is_new_and_is_found_when_started_again() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     let mut fleet = Fleet::scout(&air, 3.0);
@@ -155,13 +155,13 @@ fn a_robot_that_only_scouts_ends_where_its_address_is_new_and_is_found_when_star
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_loss_of_5_percent_changes_nothing() {
     lossy(5);
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_loss_of_20_percent_changes_nothing() {
     lossy(20);
 }
@@ -178,7 +178,7 @@ fn lossy(percent: u32) {
 }
 
 #[test]
-#[ignore = "root only, in network namespaces: run with --ignored --test-threads=1"]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_slow_link_is_enough() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
     name_list().iter().for_each(|name| air.slow(name, "384kbit"));
@@ -191,7 +191,7 @@ fn a_slow_link_is_enough() {
 
 /// Not a test: what the tests start in each robot's namespace (see the module).
 #[test]
-#[ignore = "started by the other tests"]
+#[ignore = "night: no test; the others start it"]
 fn spectator() {
     spectator::main();
 }

@@ -144,7 +144,20 @@ fn a_corridor_with_little_in_it_stays_uncertain_along_its_axis() {
 
 /// Where one shelf or room looks like the next, and no end is in sight, nothing tells which one it is.
 #[test]
+fn rooms_without_end_are_ambiguous() {
+    repeats_are_ambiguous(&[(true, 3.0)], &[1]);
+}
+
+#[test]
+#[ignore = "night: more worlds"]
 fn shelves_and_rooms_without_end_are_ambiguous() {
+    repeats_are_ambiguous(&[(false, 3.0), (false, 5.0), (true, 3.0), (true, 5.0)], &[1, 5]);
+}
+
+/// Of aisles with walls or without, cells of so many metres, and of halls with these seeds: two worlds of each kind of aisle,
+/// if two halls are asked for.
+fn repeats_are_ambiguous(aisles: &[(bool, f64)], halls: &[u64]) {
+    let worlds = halls.len();
     let tally = |worlds: Vec<(World, [f64; 2])>| {
         let (mut one, mut several, mut elsewhere) = (0, 0, 0);
         for (world, spread) in worlds {
@@ -168,18 +181,17 @@ fn shelves_and_rooms_without_end_are_ambiguous() {
         }
         (one, several, elsewhere)
     };
-    for walls in [false, true] {
-        for cell in [3.0, 5.0] {
-            let (one, several, elsewhere) =
-                tally((1..3).map(|seed| (World::aisles(cell, walls, seed), [cell, 0.3])).collect());
-            println!("cells of {cell} m, walls: {walls}: {several} ambiguous, {elsewhere} elsewhere, {one} aligned");
-            // Every other one was aligned with the wrong cell before such rivals were looked for.
-            assert!(several >= 30 && one * 20 <= several && 2 * elsewhere >= several);
-        }
+    for &(walls, cell) in aisles {
+        let seeds = 1..=worlds as u64;
+        let (one, several, elsewhere) =
+            tally(seeds.map(|seed| (World::aisles(cell, walls, seed), [cell, 0.3])).collect());
+        println!("cells of {cell} m, walls: {walls}: {several} ambiguous, {elsewhere} elsewhere, {one} aligned");
+        // Every other one was aligned with the wrong cell before such rivals were looked for.
+        assert!(several >= 15 * worlds && one * 20 <= several && 2 * elsewhere >= several);
     }
-    let (one, several, elsewhere) = tally([1, 5].map(|seed| (World::hall(seed), [5.0, 3.0])).into());
+    let (one, several, elsewhere) = tally(halls.iter().map(|&seed| (World::hall(seed), [5.0, 3.0])).collect());
     println!("halls: {several} ambiguous, {elsewhere} elsewhere, {one} aligned");
-    assert!(one >= 30 && several * 20 <= one && elsewhere <= several);
+    assert!(one >= 15 * worlds && several * 20 <= one && elsewhere <= several);
 }
 
 /// Summaries only rank candidates; this prints how well. Two different streets must be told apart.

@@ -136,15 +136,15 @@ mod tests {
     use super::*;
     use crate::swarm::fake::{Bug, Fake, with_bug};
 
-    /// Seeds that an honest stand-in survives: it knows nothing of forks, so not all of them.
-    fn survived() -> Vec<u64> {
-        (0..40).filter(|seed| run_with::<Fake>(*seed, None, true).violation.is_none()).collect()
+    /// The first seeds that an honest fake survives: it knows nothing of forks, so not all of them.
+    fn survived(count: usize) -> Vec<u64> {
+        (0..40).filter(|seed| run_with::<Fake>(*seed, None, true).violation.is_none()).take(count).collect()
     }
 
     #[test]
     fn what_is_not_drawn_from_the_seed_and_what_panics_is_found() {
-        let seeds = survived();
-        assert!(seeds.len() > 5, "{seeds:?}");
+        let seeds = survived(4);
+        assert_eq!(seeds.len(), 4, "{seeds:?}");
         let broken = |bug| {
             let run = || seeds.iter().find_map(|seed| run_with::<Fake>(*seed, None, true).violation);
             with_bug(bug, run).map(|violation| violation.invariant)
@@ -157,7 +157,7 @@ mod tests {
     #[test]
     fn a_tally_adds_up() {
         let mut tally = Tally::default();
-        let mut report = run_with::<Fake>(survived()[0], None, false);
+        let mut report = run_with::<Fake>(survived(1)[0], None, false);
         tally.add(&report);
         report.violation = Some(Violation { invariant: "x".into(), at_secs: 1.0, what: "y".into() });
         report.settled_secs = 1e3;

@@ -97,10 +97,21 @@ fn rms(errors: &[(u32, f64)]) -> f64 {
 }
 
 #[test]
+fn two_robots_agree_with_the_survey() {
+    agree_with_the_survey(3..5, 20);
+}
+
+#[test]
+#[ignore = "night: the log in full"]
 fn five_robots_agree_with_the_survey() {
+    agree_with_the_survey(0..5, 100);
+}
+
+/// These of the five robots alone; they state so many sightings of one another at least.
+fn agree_with_the_survey(robots: core::ops::Range<usize>, positions_min: usize) {
     let Some(data) = real_data("mrclam_dataset1") else { return };
     let out = tempfile::tempdir().unwrap();
-    let recordings = prepare(&data, out.path(), 1).unwrap();
+    let recordings: Vec<Recording> = prepare(&data, out.path(), 1).unwrap().drain(robots).collect();
     let survey = [false, true].map(|exchanged| survey(&data, exchanged));
     let names: Vec<&str> = recordings.iter().map(|r| r.manifest().robot.as_str()).collect();
     let all: Vec<Vec<Submap>> = recordings.iter().map(submaps).collect();
@@ -205,10 +216,13 @@ fn five_robots_agree_with_the_survey() {
     println!("survey, with two names exchanged: RMS {:.3} m, {exchanged:.3?}", rms(&exchanged));
     println!("survey, as printed: RMS {:.3} m", rms(&printed));
     println!("merged with {:?}", status.merged_with);
-    assert_eq!(status.merged_with.len(), names.len() - 1, "the five are not in one frame");
+    assert_eq!(status.merged_with.len(), names.len() - 1, "the robots are not in one frame");
     assert_eq!((joined, exchanged.len()), (map.submaps.len(), 15));
     assert!(!alignments().any(|edge| edge.weight > 0.0 && wrong(edge)), "a false alignment is used");
-    assert!(positions.len() > 100 && used * 20 >= positions.len() * 19, "what robots saw of one another does not fit");
+    assert!(
+        positions.len() >= positions_min && used * 20 >= positions.len() * 19,
+        "what robots saw of one another does not fit"
+    );
     assert!(off.iter().sum::<f64>() < 3.0 * off.len() as f64, "sightings are off by more than they say");
     assert!(rms(&exchanged) <= RMS_MAX, "{:.3} m", rms(&exchanged));
     assert!(rms(&printed) > 0.5, "as printed two landmarks cannot fit");

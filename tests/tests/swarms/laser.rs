@@ -76,10 +76,22 @@ fn off(a: &Se3, b: &Se3) -> (f64, f64) {
 }
 
 #[test]
+fn two_robots_merge_on_a_real_planar_laser() {
+    robots_merge(2);
+}
+
+#[test]
+#[ignore = "night: the log in full"]
 fn three_robots_merge_on_a_real_planar_laser() {
+    robots_merge(3);
+}
+
+/// The first of the three robots alone, if fewer are asked for.
+fn robots_merge(robots: usize) {
     let Some(data) = real_data("lidar2d_radish") else { return };
     let out = tempfile::tempdir().unwrap();
-    let recordings = prepare(&data, out.path(), 1).unwrap();
+    let mut recordings = prepare(&data, out.path(), 1).unwrap();
+    recordings.truncate(robots);
     let wires = play(&recordings, 1).unwrap();
     let Snapshot { status, frames, map, graph, stats, .. } = wires.agents[0].snapshot(wires.now);
     for pair in &frames.pairs {
@@ -152,9 +164,9 @@ fn three_robots_merge_on_a_real_planar_laser() {
         distances[last],
         angles[last]
     );
-    assert_eq!(status.merged_with.len(), 2, "merged with {:?}", status.merged_with);
+    assert_eq!(status.merged_with.len(), robots - 1, "merged with {:?}", status.merged_with);
     assert!(!alignments().filter(|edge| edge.weight > 0.0).any(|edge| wrong(&edge)), "a false alignment is used");
     assert!(distances[middle] <= MEDIAN.0 && angles[middle] <= MEDIAN.1);
     assert!(distances[last] <= WORST.0 && angles[last] <= WORST.1);
-    assert!(loops >= 5, "only {loops} loops between robots were looked at");
+    assert!(all.len() >= 50 && (robots < 3 || loops >= 5), "{} relations, {loops} loops between robots", all.len());
 }

@@ -33,9 +33,19 @@ fn check(report: &Report, robots: usize, metric: &[&str]) {
 
 #[test]
 fn robots_of_unknown_units_end_in_one_map() {
+    units_are_found(1..=2);
+}
+
+#[test]
+#[ignore = "night: six swarms"]
+fn robots_of_unknown_units_end_in_one_map_whatever_the_seed() {
+    units_are_found(1..=6);
+}
+
+fn units_are_found(seeds: core::ops::RangeInclusive<u64>) {
     let scenario = Scenario::parse(SCALES).unwrap();
     let (mut sum, mut count) = (0.0, 0.0);
-    for seed in 1..=6 {
+    for seed in seeds {
         let outcome = run(&scenario, seed);
         let report = Report::of(&outcome);
         check(&report, 3, &[]);
@@ -51,7 +61,7 @@ fn robots_of_unknown_units_end_in_one_map() {
         println!("seed {seed}: {used} of {} loops of one robot used", loops.len());
         assert!(used > 0 && used == loops.iter().filter(|e| e.agreed).count(), "{loops:?}");
     }
-    // Pairs of one run share what they are made of; six runs of three pairs tell a lie by a factor of two.
+    // Pairs of one run share what they are made of; some runs of three pairs tell a lie by a factor of two.
     assert!((3.5..14.0).contains(&(sum / count)), "{}", sum / count);
 }
 
@@ -85,11 +95,21 @@ fn shelves_that_look_alike_are_not_merged_wrongly() {
 /// whoever it was taken for a neighbour of parts from it.
 #[test]
 fn who_has_seen_its_own_place_repeat_merges_with_nobody_for_long() {
+    repeats_are_seen(&[4]);
+}
+
+#[test]
+#[ignore = "night: five swarms"]
+fn who_has_seen_its_own_place_repeat_merges_with_nobody_for_long_whatever_the_seed() {
+    // Of the first eight, those that merge at all; before robots told, three of them stayed merged to the end.
+    repeats_are_seen(&[1, 4, 5, 6, 8]);
+}
+
+fn repeats_are_seen(seeds: &[u64]) {
     let aisles = SHELVES.replace("aliased = true", "aliased = true\naisles = true\nmargin_m = 25.0");
     // What is wrong for a while is no violation here.
     let aisles = format!("{aisles}\n[expect]\nerror_max_m = 1000.0\nerror_max_deg = 180.0\n");
-    // Of the first eight, those that merge at all; before robots told, three of them stayed merged to the end.
-    for seed in [1, 4, 5, 6, 8] {
+    for &seed in seeds {
         let report = simulate(&aisles, seed).unwrap();
         assert!(report.violation.is_none(), "seed {seed}: {:?}", report.violation);
         assert!(report.robots.iter().all(|robot| robot.merged_with.is_empty()), "seed {seed}: {:?}", report.robots);

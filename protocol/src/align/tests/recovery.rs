@@ -103,7 +103,7 @@ fn pure_outliers_are_never_accepted() {
 }
 
 #[test]
-#[ignore = "the large counterpart of the above: a minute"]
+#[ignore = "night: the large counterpart of the above"]
 fn a_thousand_pure_outliers_a_thousand_times_are_never_accepted() {
     let similar = Model::Similarity { scale_min: 0.4, scale_max: 2.5 };
     for (model, runs) in [(Model::Rigid, 1000), (similar, 100)] {
