@@ -4,7 +4,7 @@
 # had.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-merganser=$PWD/target/release/merganser
+merganser=${CARGO_TARGET_DIR:-$PWD/target}/release/merganser
 script=$PWD/agent/examples/live_poses.py
 recordings=$PWD/agent/recordings
 [ -x "$merganser" ] || cargo build --release --locked -p merganser
