@@ -5,6 +5,7 @@
 //! MERGANSER_KILLS=500 cargo test --release -p merganser --test attacks -- --ignored --test-threads=1 --nocapture
 //! ```
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
+#![allow(clippy::print_stdout, reason = "what a test saw is worth a line")]
 
 #[path = "../common/mod.rs"]
 mod common;

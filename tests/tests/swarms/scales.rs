@@ -116,7 +116,9 @@ fn repeats_are_seen(seeds: &[u64]) {
         let when = |is_one: fn(&Event) -> bool| {
             report.told.iter().filter(move |told| is_one(&told.event)).map(|told| told.at_secs)
         };
-        let first = when(|event| matches!(event, Event::Merged { .. })).next().expect("nothing was at stake");
+        let first = when(|event| matches!(event, Event::Merged { .. }))
+            .next()
+            .unwrap_or_else(|| panic!("nothing was at stake"));
         let last = when(|event| matches!(event, Event::Unmerged { .. })).next_back().unwrap();
         assert!(last - first < 10.0, "seed {seed}: wrong from {first} s to {last} s");
     }
