@@ -5,16 +5,15 @@ pub mod cli;
 pub mod commands;
 pub mod config;
 pub mod demo;
-pub mod depth;
 pub mod driver;
 pub mod host;
 pub mod journal;
 pub mod keys;
 pub mod link;
-pub mod observation;
 pub mod picture;
 pub mod queue;
-pub mod recording;
 pub mod store;
 pub mod telemetry;
 pub mod trust;
+
+pub use merganser_recording::{self as recording, observation};

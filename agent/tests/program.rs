@@ -17,7 +17,7 @@ const PROGRAM: &str = env!("CARGO_BIN_EXE_merganser");
 fn recording(folder: &Path) {
     std::fs::create_dir_all(folder).unwrap();
     let keyframes: Vec<_> = (0..8).map(|index| common::keyframe(0, index)).collect();
-    let mut table = format!("{}\n", merganser_protocol::recording::KEYFRAMES_HEADER);
+    let mut table = format!("{}\n", merganser_recording::manifest::KEYFRAMES_HEADER);
     for (index, keyframe) in keyframes.iter().enumerate() {
         let cloud = format!("{index}.bin");
         let bytes: Vec<u8> = keyframe.points.iter().flatten().flat_map(|x| x.to_le_bytes()).collect();

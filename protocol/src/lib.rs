@@ -17,18 +17,15 @@
 
 pub mod agent;
 pub mod align;
-pub mod carmen;
 pub mod config;
 pub mod estimate;
-pub mod geometry;
 pub mod gossip;
 pub mod ids;
-pub mod line_error;
-pub mod mrclam;
-pub mod recording;
 pub mod replica;
 mod simd;
 pub mod snapshot;
 pub mod submap;
 pub mod time;
 pub mod wire;
+
+pub use merganser_geometry as geometry;

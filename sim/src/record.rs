@@ -1,5 +1,5 @@
 //! Writing recordings, the demo's among them: what each robot of a scenario drives and sees, in the format of
-//! `merganser_protocol::recording`, with the truth beside it. One seed gives the same bytes on every machine: all noise
+//! `merganser_recording::manifest`, with the truth beside it. One seed gives the same bytes on every machine: all noise
 //! is seeded, all floats are printed with a fixed number of digits, and clouds are whole numbers of 2 mm.
 
 use crate::scenario::Scenario;
@@ -8,12 +8,12 @@ use crate::world::trajectory::Trajectory;
 use core::fmt::Write as _;
 use merganser_protocol::geometry::{Covariance, Se3};
 use merganser_protocol::ids::{Name, NameError};
-use merganser_protocol::recording::{
-    CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, PlaceFormat, TRUTH_HEADER, UP_HEADER, VERSION, XYZ_I16_UNIT_M,
-};
 use merganser_protocol::submap::landmarks::DESCRIPTOR_LEN;
 use merganser_protocol::submap::{CovarianceOf, Mark};
 use merganser_protocol::wire::fact::ScaleKind;
+use merganser_recording::manifest::{
+    CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, PlaceFormat, TRUTH_HEADER, UP_HEADER, VERSION, XYZ_I16_UNIT_M,
+};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "the whole file is a test")]
 
-use merganser_protocol::recording::{
+use merganser_recording::manifest::{
     CloudFormat, FORMAT, KEYFRAMES_HEADER, Manifest, TRUTH_HEADER, VERSION, XYZ_I16_UNIT_M,
 };
 use merganser_sim::record::record;

@@ -7,7 +7,6 @@ use super::views::Views;
 use super::*;
 use crate::recording::{Drift, Writer, cloud};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
-use merganser_protocol::recording::{CloudFormat, Manifest};
 use merganser_protocol::snapshot::{
     EdgeView, FrameView, FramesView, GraphView, MapView, PairStatus, PairView, PoseView, RelationView, StatsView,
     StatusView, SubmapView,
@@ -15,6 +14,7 @@ use merganser_protocol::snapshot::{
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::ScaleKind;
+use merganser_recording::manifest::{CloudFormat, Manifest};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::BTreeMap;
 

@@ -165,7 +165,7 @@ impl<'a> Around<'a> {
 mod tests {
     use super::*;
     use crate::geometry::Se3;
-    use crate::geometry::test_support::rng;
+    use crate::geometry::sampling::rng;
     use nalgebra::Vector6;
     use rand::Rng;
     use std::collections::BTreeSet;

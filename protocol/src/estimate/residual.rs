@@ -64,7 +64,7 @@ impl<const N: usize> Residual<N> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::test_support::{normals, pose, rng, similarity};
+    use crate::geometry::sampling::{normals, pose, rng, similarity};
     use crate::geometry::{Covariance, Se3, Sim3};
 
     /// Draws four poses whose residual has about the size `h`.

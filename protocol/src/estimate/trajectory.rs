@@ -100,7 +100,7 @@ impl Trajectory {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::test_support::{covariance, pose, rng};
+    use crate::geometry::sampling::{covariance, pose, rng};
 
     fn trajectory(n: usize) -> Trajectory {
         let mut rng = rng(41);

@@ -63,7 +63,7 @@ pub(super) fn inverse((a, sigma): &Way) -> Way {
 mod tests {
     use super::*;
     use crate::geometry::PoseWithCovariance;
-    use crate::geometry::test_support::{covariance, pose, rng};
+    use crate::geometry::sampling::{covariance, pose, rng};
 
     #[test]
     fn ways_are_what_the_trajectory_has_between_its_anchors() {

@@ -90,7 +90,7 @@ impl Search<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::test_support::{rng, uniform};
+    use crate::geometry::sampling::{rng, uniform};
     use rand::Rng;
 
     fn graph(rng: &mut impl Rng, n: usize, density: f64) -> Vec<Set> {

@@ -187,7 +187,7 @@ pub(super) fn log_scale_sigma<const N: usize>(covariance: &SMatrix<f64, N, N>) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::test_support::{normals, pose, rng};
+    use crate::geometry::sampling::{normals, pose, rng};
     use nalgebra::Vector6;
 
     #[test]

@@ -2,7 +2,7 @@
 
 use super::world::{Draw, World};
 use super::*;
-use crate::geometry::test_support::rng;
+use crate::geometry::sampling::rng;
 use rand::seq::SliceRandom;
 
 const SEEDS: u64 = 100;
@@ -324,7 +324,7 @@ fn a_baseline_too_short_for_the_scale_is_refused() {
         let outcome = |alignments: &[PairAlignment]| align_frames_sim(&w.alpha, &w.beta, alignments, &config(3.0));
         let twins = [sorted[0], sorted[0], sorted[0]].map(|a| {
             let mut rng = rng(seed);
-            let nudge = crate::geometry::test_support::normals::<6>(&mut rng) * 1e-4;
+            let nudge = crate::geometry::sampling::normals::<6>(&mut rng) * 1e-4;
             PairAlignment { t_i_j: PoseWithCovariance { pose: a.t_i_j.pose.retract(&nudge), ..a.t_i_j }, ..a }
         });
         let mut near: Vec<PairAlignment> = twins.to_vec();

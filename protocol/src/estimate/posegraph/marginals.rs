@@ -265,7 +265,7 @@ fn fused(a: &Marginal, b: &Marginal, independent: f64) -> Result<Marginal, Table
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::test_support::{covariance, draw, pose, rng};
+    use crate::geometry::sampling::{covariance, draw, pose, rng};
 
     fn table(seed: u64, poses: u64) -> BTreeMap<u64, Marginal> {
         let rng = &mut rng(seed);

@@ -57,7 +57,7 @@ pub fn log_jacobians<const N: usize, G: Group<N>>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::test_support::{normals, rng, uniform};
+    use crate::geometry::sampling::{normals, rng, uniform};
     use crate::geometry::{Se3, Sim3};
     use nalgebra::Vector3;
     use rand_chacha::ChaCha8Rng;

@@ -5,13 +5,13 @@
 use super::sets::{Place, Set};
 use crate::bench::cpu::thread_seconds;
 use anyhow::{Context, ensure};
-use merganser_protocol::carmen::{Parser, keyframes};
 use merganser_protocol::config::{Sensor, SubmapConfig};
 use merganser_protocol::estimate::graph::{Factor, Graph, Label};
 use merganser_protocol::estimate::solve::minimum;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, So3};
 use merganser_protocol::ids::{EntryId, FrameId, RobotId, SubmapId};
 use merganser_protocol::submap::{Submap, SubmapBuilder, describe};
+use merganser_recording::carmen::{Parser, keyframes};
 use nalgebra::Vector3;
 use std::collections::BTreeSet;
 use std::io::Read;

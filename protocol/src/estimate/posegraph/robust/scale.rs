@@ -83,7 +83,7 @@ fn log_likelihood(innovations: &[Innovation], volume: f64, s: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::test_support::{normals, rng, uniform};
+    use crate::geometry::sampling::{normals, rng, uniform};
 
     /// d² of `n` closures with a noise of scale `s`, ln √det of a tenth of a unit each.
     fn noise(seed: u64, n: usize, s: f64) -> Vec<Innovation> {

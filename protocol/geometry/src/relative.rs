@@ -110,10 +110,10 @@ impl Relative {
 
 #[cfg(test)]
 mod tests {
-    use super::super::test_support::{covariance, draw, pose, rng, similarity};
     use super::*;
-    use crate::geometry::Covariance;
-    use crate::geometry::sim3::Vector7;
+    use crate::Covariance;
+    use crate::sampling::{covariance, draw, pose, rng, similarity};
+    use crate::sim3::Vector7;
 
     #[test]
     fn mixing_lifts_and_metric_stays_metric() {

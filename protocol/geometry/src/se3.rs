@@ -18,11 +18,13 @@ pub struct Se3 {
 
 impl Se3 {
     /// The identity.
+    #[inline]
     pub fn identity() -> Self {
         Self { rotation: So3::identity(), translation: Vector3::zeros() }
     }
 
     /// From its parts.
+    #[inline]
     pub fn new(rotation: So3, translation: Vector3<f64>) -> Self {
         Self { rotation, translation }
     }
@@ -35,6 +37,7 @@ impl Se3 {
     }
 
     /// The 4×4 homogeneous matrix.
+    #[inline]
     pub fn matrix(&self) -> Matrix4<f64> {
         let mut m = Matrix4::identity();
         m.fixed_view_mut::<3, 3>(0, 0).copy_from(&self.rotation.matrix());
@@ -48,12 +51,14 @@ impl Se3 {
     }
 
     /// exp(ξ^), ξ = (ρ, φ).
+    #[inline]
     pub fn exp(xi: &Vector6<f64>) -> Self {
         let (rho, phi) = split(xi);
         Self::new(So3::exp(&phi), so3::left_jacobian(&phi) * rho)
     }
 
     /// log: ξ = (ρ, φ) with |φ| ≤ π.
+    #[inline]
     pub fn log(&self) -> Vector6<f64> {
         let phi = self.rotation.log();
         join(&(so3::left_jacobian_inv(&phi) * self.translation), &phi)
@@ -61,6 +66,7 @@ impl Se3 {
 
     /// The inverse.
     #[must_use]
+    #[inline]
     pub fn inverse(&self) -> Self {
         let r = self.rotation.inverse();
         Self::new(r, -(r * self.translation))
@@ -68,16 +74,19 @@ impl Se3 {
 
     /// `T ⊕ δ = T exp(δ^)`.
     #[must_use]
+    #[inline]
     pub fn retract(&self, delta: &Vector6<f64>) -> Self {
         *self * Self::exp(delta)
     }
 
     /// The δ with `self ⊕ δ = other`.
+    #[inline]
     pub fn local(&self, other: &Self) -> Vector6<f64> {
         (self.inverse() * *other).log()
     }
 
     /// Ad(T): `T exp(ξ^) T⁻¹ = exp((Ad ξ)^)`.
+    #[inline]
     pub fn adjoint(&self) -> Matrix6<f64> {
         let r = self.rotation.matrix();
         blocks(&r, &(hat(&self.translation) * r), &r)
@@ -92,6 +101,7 @@ impl Se3 {
 
 impl core::ops::Mul for Se3 {
     type Output = Self;
+    #[inline]
     fn mul(self, other: Self) -> Self {
         Self::new(self.rotation * other.rotation, self.rotation * other.translation + self.translation)
     }
@@ -99,6 +109,7 @@ impl core::ops::Mul for Se3 {
 
 impl core::ops::Mul<Vector3<f64>> for Se3 {
     type Output = Vector3<f64>;
+    #[inline]
     fn mul(self, p: Vector3<f64>) -> Vector3<f64> {
         self.rotation * p + self.translation
     }
@@ -136,11 +147,13 @@ pub fn ad(xi: &Vector6<f64>) -> Matrix6<f64> {
 }
 
 /// (ρ, φ) of a tangent vector.
+#[inline]
 pub fn split(xi: &Vector6<f64>) -> (Vector3<f64>, Vector3<f64>) {
     (xi.fixed_rows::<3>(0).into_owned(), xi.fixed_rows::<3>(3).into_owned())
 }
 
 /// The tangent vector (ρ, φ).
+#[inline]
 pub fn join(rho: &Vector3<f64>, phi: &Vector3<f64>) -> Vector6<f64> {
     Vector6::new(rho.x, rho.y, rho.z, phi.x, phi.y, phi.z)
 }

@@ -13,6 +13,7 @@ pub struct So3(UnitQuaternion<f64>);
 
 impl So3 {
     /// The identity.
+    #[inline]
     pub fn identity() -> Self {
         Self(UnitQuaternion::identity())
     }
@@ -25,6 +26,7 @@ impl So3 {
     }
 
     /// Quaternion coefficients `[x, y, z, w]` with `w ≥ 0`.
+    #[inline]
     pub fn xyzw(&self) -> [f64; 4] {
         let q = self.0.quaternion();
         let sign = if q.w < 0.0 { -1.0 } else { 1.0 };
@@ -51,11 +53,13 @@ impl So3 {
     }
 
     /// The rotation matrix.
+    #[inline]
     pub fn matrix(&self) -> Matrix3<f64> {
         self.0.to_rotation_matrix().into_inner()
     }
 
     /// exp(φ^), φ in rad.
+    #[inline]
     pub fn exp(phi: &Vector3<f64>) -> Self {
         let angle = phi.norm();
         let half = 0.5 * angle;
@@ -66,6 +70,7 @@ impl So3 {
     }
 
     /// log: φ with |φ| ≤ π.
+    #[inline]
     pub fn log(&self) -> Vector3<f64> {
         let [x, y, z, w] = self.xyzw();
         let v = Vector3::new(x, y, z);
@@ -77,22 +82,26 @@ impl So3 {
 
     /// The inverse.
     #[must_use]
+    #[inline]
     pub fn inverse(&self) -> Self {
         Self(self.0.inverse())
     }
 
     /// `R ⊕ δ = R exp(δ^)`.
     #[must_use]
+    #[inline]
     pub fn retract(&self, delta: &Vector3<f64>) -> Self {
         *self * Self::exp(delta)
     }
 
     /// The δ with `self ⊕ δ = other`.
+    #[inline]
     pub fn local(&self, other: &Self) -> Vector3<f64> {
         (self.inverse() * *other).log()
     }
 
     /// Ad(R) = R.
+    #[inline]
     pub fn adjoint(&self) -> Matrix3<f64> {
         self.matrix()
     }
@@ -104,6 +113,7 @@ impl So3 {
     }
 
     /// Rotation angle in rad, 0 to π.
+    #[inline]
     pub fn angle(&self) -> f64 {
         self.log().norm()
     }
@@ -111,6 +121,7 @@ impl So3 {
 
 impl core::ops::Mul for So3 {
     type Output = Self;
+    #[inline]
     fn mul(self, other: Self) -> Self {
         Self(UnitQuaternion::new_normalize((self.0 * other.0).into_inner()))
     }
@@ -118,12 +129,14 @@ impl core::ops::Mul for So3 {
 
 impl core::ops::Mul<Vector3<f64>> for So3 {
     type Output = Vector3<f64>;
+    #[inline]
     fn mul(self, v: Vector3<f64>) -> Vector3<f64> {
         self.0 * v
     }
 }
 
 /// The skew-symmetric matrix v^ with `v^ u = v × u`.
+#[inline]
 pub fn hat(v: &Vector3<f64>) -> Matrix3<f64> {
     Matrix3::new(0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0)
 }

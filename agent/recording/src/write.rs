@@ -6,11 +6,9 @@ use super::error::{Problem, RecordingError, on};
 use super::landmarks;
 use super::places::Rows;
 use super::{KEYFRAMES, MANIFEST, PLACES, POSITIONS, TRUTH, UPS};
+use crate::manifest::{FORMAT, KEYFRAMES_HEADER, Manifest, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER, VERSION};
 use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::geometry::Se3;
-use merganser_protocol::recording::{
-    FORMAT, KEYFRAMES_HEADER, Manifest, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER, VERSION,
-};
 use merganser_protocol::submap::Keyframe;
 use std::fmt::Write as _;
 use std::fs;

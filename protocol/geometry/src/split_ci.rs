@@ -257,8 +257,8 @@ fn symmetric(m: Matrix6<f64>) -> Matrix6<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::test_support::{covariance, draw, pose, rng};
     use super::*;
+    use crate::sampling::{covariance, draw, pose, rng};
     use rand::Rng;
 
     fn split(pose: Se3, common: &Covariance<6>, independent: &Covariance<6>) -> SplitEstimate {

@@ -1,9 +1,9 @@
 use super::import::{Kind, detect, open_all, prepare};
 use super::*;
+use crate::manifest::{CloudFormat, UP_HEADER};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
 use merganser_protocol::ids::Name;
-use merganser_protocol::recording::{CloudFormat, UP_HEADER};
 use merganser_protocol::submap::{CovarianceOf, Up};
 use merganser_protocol::time::Stamp;
 use nalgebra::Vector6;
@@ -312,7 +312,7 @@ fn lidar_scans_of_both_kinds_are_cut_into_robots() {
 /// The folder of data sets, or why there is none.
 fn shared(path: &str) -> Option<PathBuf> {
     let shared = std::env::var_os("MERGANSER_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
     let folder = shared.join("data").join(path);
     if !folder.is_dir() {
         println!("skipped: {} is absent (set MERGANSER_SHARED)", folder.display());

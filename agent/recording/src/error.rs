@@ -2,10 +2,10 @@
 //! the line.
 
 use super::cloud::{CLOUD_BYTES_MAX, POINTS_MAX};
+use crate::manifest::{FORMAT, KEYFRAMES_MAX, VERSION};
 use crate::observation::COORDINATE_MAX;
 use merganser_protocol::config::ConfigError;
 use merganser_protocol::geometry::CovarianceError;
-use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, VERSION};
 use merganser_protocol::submap::PlaceError;
 use std::io;
 use std::path::{Path, PathBuf};

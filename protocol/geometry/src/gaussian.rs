@@ -140,7 +140,7 @@ impl<const N: usize> Covariance<N> {
 
 impl Covariance<6> {
     /// The lower triangle, column by column: all that there is, and little more than half of the matrix.
-    pub(crate) fn packed(&self) -> [f64; 21] {
+    pub fn packed(&self) -> [f64; 21] {
         let mut out = [0.0; 21];
         let below = (0..6).flat_map(|c| (c..6).map(move |r| (r, c)));
         out.iter_mut().zip(below).for_each(|(x, at)| *x = self.0[at]);
@@ -148,7 +148,7 @@ impl Covariance<6> {
     }
 
     /// The covariance, to the bit, that was packed.
-    pub(crate) fn unpacked(packed: &[f64; 21]) -> Self {
+    pub fn unpacked(packed: &[f64; 21]) -> Self {
         let mut out = Matrix6::zeros();
         let below = (0..6).flat_map(|c| (c..6).map(move |r| (r, c)));
         packed.iter().zip(below).for_each(|(&x, (r, c))| (out[(r, c)], out[(c, r)]) = (x, x));
@@ -287,8 +287,8 @@ impl SimWithCovariance {
 
 #[cfg(test)]
 mod tests {
-    use super::super::test_support::{covariance, matrix, pose, rng, similarity};
     use super::*;
+    use crate::sampling::{covariance, matrix, pose, rng, similarity};
     use nalgebra::Vector6;
 
     #[test]
@@ -394,14 +394,8 @@ mod tests {
         let q: Covariance<6> = covariance(&mut rng).scaled(0.01);
         let mut sum = 0.0;
         for _ in 0..n {
-            let a = PoseWithCovariance {
-                pose: truth.retract(&super::super::test_support::draw(&mut rng, &p)),
-                covariance: p,
-            };
-            let b = PoseWithCovariance {
-                pose: truth.retract(&super::super::test_support::draw(&mut rng, &q)),
-                covariance: q,
-            };
+            let a = PoseWithCovariance { pose: truth.retract(&crate::sampling::draw(&mut rng, &p)), covariance: p };
+            let b = PoseWithCovariance { pose: truth.retract(&crate::sampling::draw(&mut rng, &q)), covariance: q };
             let d2 = a.distance_squared(&b);
             assert!((d2 - b.distance_squared(&a)).abs() < 1e-9 * (1.0 + d2), "symmetric");
             sum += d2;

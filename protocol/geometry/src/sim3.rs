@@ -36,11 +36,13 @@ pub struct Sim3 {
 
 impl Sim3 {
     /// The identity.
+    #[inline]
     pub fn identity() -> Self {
         Self::from_se3(&Se3::identity())
     }
 
     /// From its parts, `scale` > 0 assumed.
+    #[inline]
     pub fn new(rotation: So3, translation: Vector3<f64>, scale: f64) -> Self {
         Self { rotation, translation, scale }
     }
@@ -53,16 +55,19 @@ impl Sim3 {
     }
 
     /// A rigid motion as a similarity of scale 1.
+    #[inline]
     pub fn from_se3(t: &Se3) -> Self {
         Self::new(t.rotation, t.translation, 1.0)
     }
 
     /// Rotation and translation, the scale dropped.
+    #[inline]
     pub fn to_se3(&self) -> Se3 {
         Se3::new(self.rotation, self.translation)
     }
 
     /// The matrix `[sR t; 0 1]`.
+    #[inline]
     pub fn matrix(&self) -> Matrix4<f64> {
         let mut m = Matrix4::identity();
         m.fixed_view_mut::<3, 3>(0, 0).copy_from(&(self.rotation.matrix() * self.scale));
@@ -71,12 +76,14 @@ impl Sim3 {
     }
 
     /// exp(ξ^), ξ = (ρ, φ, λ).
+    #[inline]
     pub fn exp(xi: &Vector7) -> Self {
         let (rho, phi, lambda) = split(xi);
         Self::new(So3::exp(&phi), Coefficients::new(phi.norm(), lambda).v(&phi) * rho, exp(lambda))
     }
 
     /// log: ξ = (ρ, φ, λ) with |φ| ≤ π.
+    #[inline]
     pub fn log(&self) -> Vector7 {
         let phi = self.rotation.log();
         let lambda = log(self.scale);
@@ -85,6 +92,7 @@ impl Sim3 {
 
     /// The inverse.
     #[must_use]
+    #[inline]
     pub fn inverse(&self) -> Self {
         let r = self.rotation.inverse();
         Self::new(r, -(r * self.translation) / self.scale, 1.0 / self.scale)
@@ -92,16 +100,19 @@ impl Sim3 {
 
     /// `T ⊕ δ = T exp(δ^)`.
     #[must_use]
+    #[inline]
     pub fn retract(&self, delta: &Vector7) -> Self {
         *self * Self::exp(delta)
     }
 
     /// The δ with `self ⊕ δ = other`.
+    #[inline]
     pub fn local(&self, other: &Self) -> Vector7 {
         (self.inverse() * *other).log()
     }
 
     /// Ad(T): `T exp(ξ^) T⁻¹ = exp((Ad ξ)^)`; [[sR, t^R, −t], [0, R, 0], [0, 0, 1]].
+    #[inline]
     pub fn adjoint(&self) -> Matrix7 {
         let r = self.rotation.matrix();
         blocks(&(r * self.scale), &(hat(&self.translation) * r), &-self.translation, &r, 1.0)
@@ -116,6 +127,7 @@ impl Sim3 {
 
 impl core::ops::Mul for Sim3 {
     type Output = Self;
+    #[inline]
     fn mul(self, other: Self) -> Self {
         Self::new(self.rotation * other.rotation, self * other.translation, self.scale * other.scale)
     }
@@ -123,6 +135,7 @@ impl core::ops::Mul for Sim3 {
 
 impl core::ops::Mul<Vector3<f64>> for Sim3 {
     type Output = Vector3<f64>;
+    #[inline]
     fn mul(self, p: Vector3<f64>) -> Vector3<f64> {
         self.rotation * p * self.scale + self.translation
     }
@@ -182,11 +195,13 @@ pub fn ad(xi: &Vector7) -> Matrix7 {
 }
 
 /// (ρ, φ, λ) of a tangent vector.
+#[inline]
 pub fn split(xi: &Vector7) -> (Vector3<f64>, Vector3<f64>, f64) {
     (xi.fixed_rows::<3>(0).into_owned(), xi.fixed_rows::<3>(3).into_owned(), xi[6])
 }
 
 /// The tangent vector (ρ, φ, λ).
+#[inline]
 pub fn join(rho: &Vector3<f64>, phi: &Vector3<f64>, lambda: f64) -> Vector7 {
     Vector7::from([rho.x, rho.y, rho.z, phi.x, phi.y, phi.z, lambda])
 }
@@ -210,6 +225,7 @@ struct Coefficients {
 }
 
 impl Coefficients {
+    #[inline]
     fn new(theta: f64, lambda: f64) -> Self {
         let (mut a, mut b, mut c) = (0.0, 0.0, 0.0);
         for (high, low, weight) in GAUSS_LEGENDRE {
@@ -264,7 +280,7 @@ const GAUSS_LEGENDRE: [(f64, f64, f64); 8] = [
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::se3;
+    use crate::se3;
 
     #[test]
     fn scale_one_is_se3() {

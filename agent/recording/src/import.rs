@@ -5,10 +5,10 @@
 
 use super::error::{Problem, RecordingError, on};
 use super::{Drift, KEYFRAMES, MANIFEST, Recording, Writer, import_laser, import_lidar, import_mrclam, import_rgbd};
+use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
 use merganser_protocol::config::Config;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::ids::Name;
-use merganser_protocol::recording::{CloudFormat, FORMAT, Manifest, VERSION};
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::Stamp;
 use std::collections::BTreeMap;

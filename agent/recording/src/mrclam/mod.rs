@@ -13,7 +13,7 @@ mod smooth;
 pub use front::{Calibration, keyframes, position};
 
 use crate::line_error::LineError;
-use crate::time::Stamp;
+use merganser_protocol::time::Stamp;
 use std::collections::BTreeMap;
 use thiserror::Error;
 

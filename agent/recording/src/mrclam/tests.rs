@@ -1,6 +1,6 @@
 use super::*;
-use crate::geometry::Se3;
-use crate::submap::Keyframe;
+use merganser_protocol::geometry::Se3;
+use merganser_protocol::submap::Keyframe;
 use nalgebra::{Vector2, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -56,7 +56,7 @@ fn drive(seed: u64) -> (Vec<Speed>, Vec<Sighting>, Vec<(Stamp, Se3)>) {
         let stamp = Stamp(tick * 50_000_000);
         let speed = Speed { stamp, forward: 0.1, angular: if (tick / 100) % 3 == 0 { 0.4 } else { 0.05 } };
         speeds.push(speed);
-        let turn = crate::geometry::So3::exp(&Vector3::new(0.0, 0.0, heading));
+        let turn = merganser_protocol::geometry::So3::exp(&Vector3::new(0.0, 0.0, heading));
         truth.push((stamp, Se3::new(turn, Vector3::new(at.x, at.y, 0.0))));
         for (k, landmark) in landmarks.iter().enumerate() {
             let off: Vector2<f64> = landmark - at;
@@ -95,7 +95,7 @@ fn the_front_end_is_honest() {
             count += 1;
         }
         for stretch in keyframes.windows(21).step_by(10) {
-            let motion = |k: usize| crate::geometry::PoseWithCovariance {
+            let motion = |k: usize| merganser_protocol::geometry::PoseWithCovariance {
                 pose: stretch[k - 1].pose.pose.inverse() * stretch[k].pose.pose,
                 covariance: stretch[k].pose.covariance,
             };

@@ -1,15 +1,15 @@
 //! An MRCLAM data set becomes its robots: `RobotN_Odometry.dat` and `RobotN_Measurement.dat` of each, `Barcodes.dat` of all
-//! (each may be packed, `.xz`). A filter stands in for each robot's own SLAM (`merganser_protocol::mrclam`); landmarks are
+//! (each may be packed, `.xz`). A filter stands in for each robot's own SLAM (`crate::mrclam`); landmarks are
 //! handed over under their bar codes, and where other robots were seen.
 
 use super::Writer;
 use super::cloud::read_bytes;
 use super::error::{Problem, RecordingError, on};
+use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
+use crate::mrclam::{MrclamError, keyframes, position, sightings, speeds, subjects};
 use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::ids::Name;
-use merganser_protocol::mrclam::{MrclamError, keyframes, position, sightings, speeds, subjects};
-use merganser_protocol::recording::{CloudFormat, FORMAT, Manifest, VERSION};
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use std::io::Read;
 use std::path::{Path, PathBuf};

@@ -2,11 +2,11 @@
 //! refuses the recording; nothing is guessed or skipped.
 
 use super::error::{Problem, RecordingError, on};
+use crate::manifest::{KEYFRAMES_HEADER, KEYFRAMES_MAX, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER};
 use crate::observation::{COORDINATE_MAX, PositionMessage};
 use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::Name;
-use merganser_protocol::recording::{KEYFRAMES_HEADER, KEYFRAMES_MAX, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER};
 use merganser_protocol::submap::Up;
 use merganser_protocol::time::Stamp;
 use nalgebra::{Matrix6, Vector3};

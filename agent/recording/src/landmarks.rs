@@ -5,8 +5,8 @@
 use super::cloud::{Fault, read_bytes};
 use super::error::{Problem, RecordingError};
 use super::ply;
+use crate::manifest::CloudFormat;
 use merganser_protocol::geometry::Covariance;
-use merganser_protocol::recording::CloudFormat;
 use merganser_protocol::submap::Mark;
 use merganser_protocol::submap::landmarks::{DESCRIPTOR_LEN, Descriptor};
 use nalgebra::Matrix3;

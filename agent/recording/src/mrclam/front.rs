@@ -12,12 +12,12 @@
 
 use super::smooth::{Node, Seen, between, smooth};
 use super::{Sighting, Speed};
-use crate::agent::io::PositionSighting;
-use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
-use crate::ids::Name;
-use crate::submap::{CovarianceOf, Keyframe, Mark};
-use crate::time::Stamp;
 use libm::{atan2, cos, sin};
+use merganser_protocol::agent::io::PositionSighting;
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use merganser_protocol::ids::Name;
+use merganser_protocol::submap::{CovarianceOf, Keyframe, Mark};
+use merganser_protocol::time::Stamp;
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Matrix6, Vector2, Vector3};
 use std::collections::BTreeMap;
 

@@ -4,8 +4,8 @@
 
 use super::error::{Problem, RecordingError, on};
 use super::{pcd, ply};
+use crate::manifest::{CloudFormat, XYZ_I16_UNIT_M};
 use crate::observation::COORDINATE_MAX;
-use merganser_protocol::recording::{CloudFormat, XYZ_I16_UNIT_M};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;

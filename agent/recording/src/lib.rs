@@ -1,10 +1,12 @@
-//! Recordings on disk ([`merganser_protocol::recording`] is the format): opening and checking them, writing them, and
-//! making them from other people's data sets.
+//! What a SLAM gives an agent: its messages ([`observation`]), its recordings on disk ([`manifest`] is the format), and
+//! recordings made from other people's data sets ([`import`]).
 //!
 //! [`Recording::open`] reads the manifest and both tables and looks for every cloud; the clouds themselves are read one
 //! by one, by [`Recording::keyframe`]. A bad recording is refused with one error that names file and line.
 
+pub mod carmen;
 pub mod cloud;
+pub mod depth;
 mod drift;
 mod error;
 pub mod import;
@@ -13,6 +15,10 @@ mod import_lidar;
 mod import_mrclam;
 mod import_rgbd;
 mod landmarks;
+mod line_error;
+pub mod manifest;
+pub mod mrclam;
+pub mod observation;
 mod pcd;
 mod places;
 pub mod ply;
@@ -24,9 +30,9 @@ pub use error::{Problem, RecordingError};
 pub use table::{KeyframeLine, TruthLine};
 pub use write::Writer;
 
+use crate::manifest::{FORMAT, KEYFRAMES_MAX, Manifest, UNIT_RANGE_M, VERSION};
 use error::on;
 use merganser_protocol::agent::io::PositionSighting;
-use merganser_protocol::recording::{FORMAT, KEYFRAMES_MAX, Manifest, UNIT_RANGE_M, VERSION};
 use merganser_protocol::submap::{Keyframe, Up};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::ScaleKind;

@@ -10,12 +10,11 @@ pub mod group;
 #[cfg(test)]
 mod laws;
 pub mod relative;
+pub mod sampling;
 pub mod se3;
 pub mod sim3;
 pub mod so3;
 pub mod split_ci;
-#[cfg(test)]
-pub(crate) mod test_support;
 
 pub use gaussian::{Covariance, CovarianceError, PoseWithCovariance, SimWithCovariance};
 pub use group::Group;

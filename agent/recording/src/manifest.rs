@@ -47,12 +47,12 @@ pub struct Manifest {
     /// Always [`VERSION`].
     pub version: u32,
     /// The robot's name.
-    pub robot: crate::ids::Name,
+    pub robot: merganser_protocol::ids::Name,
     /// What made the points: free text for people, e.g. `lidar3d`, `depth`.
     pub sensor: String,
     /// What the covariance of a keyframe describes.
     #[serde(default)]
-    pub covariance_of: crate::submap::CovarianceOf,
+    pub covariance_of: merganser_protocol::submap::CovarianceOf,
     /// How clouds are stored.
     pub clouds: CloudFormat,
     /// Number of keyframes; must equal the lines of `keyframes.csv`.
@@ -72,7 +72,7 @@ pub struct Manifest {
     pub places: Option<PlaceFormat>,
     /// Overrides of the agent's core configuration that suit this sensor (e.g. `submap.voxel_m`).
     #[serde(default)]
-    pub config: crate::config::Config,
+    pub config: merganser_protocol::config::Config,
 }
 
 /// What `places.f32` holds.
@@ -83,7 +83,7 @@ pub struct PlaceFormat {
     #[serde(default)]
     pub model: String,
     /// How they are compared.
-    pub metric: crate::submap::place::Metric,
+    pub metric: merganser_protocol::submap::place::Metric,
     /// Numbers of each.
     pub numbers: usize,
 }

@@ -1,7 +1,7 @@
 //! Place descriptors of the user's own: a file of rows of numbers, one for each keyframe.
 
 use super::error::{Problem, RecordingError, on};
-use merganser_protocol::recording::PlaceFormat;
+use crate::manifest::PlaceFormat;
 use merganser_protocol::submap::place::{VECTOR_LEN_MAX, VECTOR_LEN_MIN};
 use merganser_protocol::submap::{PlaceDescriptor, PlaceError};
 use std::fs::File;
@@ -80,8 +80,8 @@ impl Rows {
 mod tests {
     use super::super::{KEYFRAMES, MANIFEST, PLACES, Recording, Writer};
     use super::*;
+    use crate::manifest::{CloudFormat, Manifest};
     use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
-    use merganser_protocol::recording::{CloudFormat, Manifest};
     use merganser_protocol::submap::place::Metric;
     use merganser_protocol::submap::{CovarianceOf, Keyframe};
     use merganser_protocol::time::Stamp;

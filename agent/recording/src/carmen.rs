@@ -4,13 +4,13 @@
 //! `FLASER n r₁ … rₙ x y θ odom_x odom_y odom_θ ipc_timestamp host logger_timestamp`: ranges in m from right to left over
 //! 180°, poses in m and rad. What lies beyond [`RANGE_M`] is left out, and with it readings that stand for no return.
 
-use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use crate::line_error::LineError;
-use crate::submap::{CovarianceOf, Keyframe};
-use crate::time::Stamp;
 use core::f64::consts::PI;
 use core::ops::RangeInclusive;
 use libm::{cos, sin};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
+use merganser_protocol::submap::{CovarianceOf, Keyframe};
+use merganser_protocol::time::Stamp;
 use nalgebra::Vector3;
 use thiserror::Error;
 

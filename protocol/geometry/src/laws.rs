@@ -146,10 +146,10 @@ fn log_scale() -> impl Strategy<Value = f64> {
     ]
 }
 
-group_laws!(so3_laws, so3::So3, crate::geometry::so3, 3, rotation());
-group_laws!(se3_laws, se3::Se3, crate::geometry::se3, 6, {
+group_laws!(so3_laws, so3::So3, crate::so3, 3, rotation());
+group_laws!(se3_laws, se3::Se3, crate::se3, 6, {
     (point(), rotation()).prop_map(|(rho, phi)| -> Vector6<f64> { se3::join(&rho, &phi) })
 });
-group_laws!(sim3_laws, sim3::Sim3, crate::geometry::sim3, 7, {
+group_laws!(sim3_laws, sim3::Sim3, crate::sim3, 7, {
     (point(), rotation(), log_scale()).prop_map(|(rho, phi, lambda)| sim3::join(&rho, &phi, lambda))
 });
