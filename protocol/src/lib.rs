@@ -12,20 +12,17 @@
 //! shell says that they are durable. An error is somebody's bad input, counted and reported as an event; a panic is our
 //! bug. `tests/agents/contract.rs` holds the core to all of this.
 //!
-//! Modules point one way: `time, ids, config` ← `geometry` ← `wire` ← `submap, align, estimate, replica` ←
-//! `gossip` ← `agent`.
+//! What this crate builds on has crates of its own, so that the compiler keeps the arrows: `types` and `geometry` ←
+//! `registration` ([`align`], [`submap`]) and `estimation` ([`estimate`]) ← this crate, whose modules point one way, too:
+//! [`wire`], [`snapshot`] ← [`replica`] ← [`gossip`] ← [`agent`].
 
 pub mod agent;
-pub mod align;
-pub mod config;
-pub mod estimate;
 pub mod gossip;
-pub mod ids;
 pub mod replica;
-mod simd;
 pub mod snapshot;
-pub mod submap;
-pub mod time;
 pub mod wire;
 
+pub use merganser_estimation as estimate;
 pub use merganser_geometry as geometry;
+pub use merganser_registration::{align, submap};
+pub use merganser_types::{config, ids, kinds, time};

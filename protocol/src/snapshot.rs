@@ -4,8 +4,8 @@
 //! Poses are `{translation: [x, y, z], rotation: [x, y, z, w], scale}`; covariances are the row-major upper triangle of
 //! the local perturbation's covariance in the order (ρ, φ[, λ]): 21 numbers for a rigid pose, 28 for a similarity.
 
-use crate::estimate::optimality::Optimality;
 use crate::geometry::{Relative, Se3, Sim3};
+pub use crate::kinds::{Optimality, PairStatus};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -106,21 +106,6 @@ pub struct FrameView {
     pub component: u64,
     /// `t_own_frame`, if connected to our own frame.
     pub t_own_frame: Option<RelationView>,
-}
-
-/// What is known about a pair of frames.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum PairStatus {
-    /// Enough consistent alignments: part of the joint estimate.
-    Merged,
-    /// Agreed alignments, but fewer than needed.
-    Provisional,
-    /// Two rival groups of alignments; or about as many pairs of submaps that fit in several ways as hold, between the two or
-    /// within either, so that the place repeats itself.
-    Ambiguous,
-    /// Alignments contradict one another.
-    Inconsistent,
 }
 
 /// One pair of frames, `a < b`.

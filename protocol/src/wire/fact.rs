@@ -3,9 +3,9 @@
 
 use crate::geometry::{Covariance, PoseWithCovariance, Relative};
 use crate::ids::{EntryId, Hash, SubmapId};
+pub use crate::kinds::{RefusalReason, ScaleKind};
 use crate::time::Stamp;
 use core::num::NonZero;
-use serde::{Deserialize, Serialize};
 
 /// One signed, immutable piece of knowledge.
 #[derive(Clone, Debug, PartialEq)]
@@ -24,17 +24,6 @@ pub enum Fact {
     Position(PositionFact),
     /// Two of the writer's own submaps that look alike in more ways than one.
     Lookalike(LookalikeFact),
-}
-
-/// Whether a frame's unit is the metre.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ScaleKind {
-    /// Units are metres (LiDAR, depth, stereo, wheel odometry).
-    #[default]
-    Metric,
-    /// Units are the frame's own (monocular SLAM): alignments live in SIM(3).
-    Unknown,
 }
 
 /// A submap, as its owner states it.
@@ -105,24 +94,6 @@ pub enum VerdictOutcome {
     },
     /// It found none.
     Refused(RefusalReason),
-}
-
-/// Why no alignment was found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RefusalReason {
-    /// Fewer correspondences than the solver needs.
-    TooFew,
-    /// Nothing better than chance.
-    NoConsensus,
-    /// Two different alignments explain the data about equally well.
-    Ambiguous,
-    /// The geometry leaves a direction undetermined, or a mirror image looks the same.
-    Degenerate,
-    /// The alignment does not fit the rest of the two submaps.
-    PoorFit,
-    /// A blob was missing or malformed.
-    BadInput,
 }
 
 /// A direct relative measurement of another robot (marker, UWB with bearing), carried to anchors by the observer.

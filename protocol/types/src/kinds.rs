@@ -1,0 +1,61 @@
+//! What several layers tell one another in one word each: of a frame's unit, a refused alignment, a pair of frames, an
+//! estimate.
+
+use serde::{Deserialize, Serialize};
+
+/// Whether a frame's unit is the metre.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ScaleKind {
+    /// Units are metres (LiDAR, depth, stereo, wheel odometry).
+    #[default]
+    Metric,
+    /// Units are the frame's own (monocular SLAM): alignments live in SIM(3).
+    Unknown,
+}
+
+/// Why no alignment was found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RefusalReason {
+    /// Fewer correspondences than the solver needs.
+    TooFew,
+    /// Nothing better than chance.
+    NoConsensus,
+    /// Two different alignments explain the data about equally well.
+    Ambiguous,
+    /// The geometry leaves a direction undetermined, or a mirror image looks the same.
+    Degenerate,
+    /// The alignment does not fit the rest of the two submaps.
+    PoorFit,
+    /// A blob was missing or malformed.
+    BadInput,
+}
+
+/// What is known about a pair of frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PairStatus {
+    /// Enough consistent alignments: part of the joint estimate.
+    Merged,
+    /// Agreed alignments, but fewer than needed.
+    Provisional,
+    /// Two rival groups of alignments; or about as many pairs of submaps that fit in several ways as hold, between the two or
+    /// within either, so that the place repeats itself.
+    Ambiguous,
+    /// Alignments contradict one another.
+    Inconsistent,
+}
+
+/// What is known about the optimality of an estimate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Optimality {
+    /// Proved to lie at the global optimum.
+    Certified,
+    /// Measurements have weights that no certificate speaks of (direction-dependent, or of unknown scale).
+    #[default]
+    NotApplicable,
+    /// No proof was found: the estimate may be a local optimum.
+    NotCertified,
+}
