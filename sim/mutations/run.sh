@@ -16,6 +16,8 @@ missed=0
 build() {
     cargo build --release --quiet -p merganser-sim \
         --config 'profile.release.package.merganser-protocol.opt-level=1' \
+        --config 'profile.release.package.merganser-registration.opt-level=1' \
+        --config 'profile.release.package.merganser-estimation.opt-level=1' \
         --config 'profile.release.package.merganser-store.opt-level=1' \
         --config 'profile.release.package.merganser-sim.opt-level=1'
 }

@@ -1,5 +1,5 @@
 //! A relative measurement between two frames or submaps, rigid where both have metric scale and a similarity
-//! otherwise, and the test that two endpoints' independent measurements of it agree (DESIGN §3, two-sided rule).
+//! otherwise, and how far two measurements of one thing lie apart (DESIGN §7).
 
 use super::{PoseWithCovariance, Sim3, SimWithCovariance};
 

@@ -1,6 +1,6 @@
 //! The state machine of one robot: facts, gossip, negotiation and the joint estimate behind one `Input`/`Output` door.
 //!
-//! The contract (tested in this module): call [`Agent::handle`] once, drain [`Agent::poll_output`] until it is empty,
+//! The contract (tested in `tests/agents/contract.rs`): call [`Agent::handle`] once, drain [`Agent::poll_output`] until it is empty,
 //! then wait until [`Agent::poll_timeout`] or the next input. Only `handle` changes anything.
 //!
 //! Nothing is advertised before it is durable: a new entry goes out as [`Output::Persist`] and takes effect (is

@@ -1,6 +1,6 @@
-//! What a robot may put on a link, by class: pose > facts > have > blobs (DESIGN §4). One token bucket of bytes; a class
-//! may spend only what the bucket holds beyond the reserve of the classes above it, so that on a slow link poses keep
-//! their pace, then new facts go, then repair, and blobs take what is left.
+//! What a robot may put on a link, by class: pose > facts > repair > have > blobs (DESIGN §4). One token bucket of bytes;
+//! a class may spend only what the bucket holds beyond the reserve of the classes above it, so that on a slow link poses
+//! keep their pace, then new facts go, then repair, and blobs take what is left.
 //!
 //! All that a robot sends comes out of one bucket, broadcasts once: questions do not say who asks, and on a radio all
 //! links share the air. So no link of the robot carries more than the rate and, after a pause, one burst

@@ -1,5 +1,5 @@
 //! The bounds of everything that travels, and deserialisers that hold to them: a claimed length is compared with its
-//! bound before anything is allocated, so no input of a few bytes can ask for a gigabyte (STYLE, "Wire").
+//! bound before anything is allocated, so no input of a few bytes can ask for a gigabyte (`docs/LIMITS.md`).
 
 use core::fmt;
 use serde::Serializer;

@@ -136,12 +136,18 @@ pub enum Gravity {
 impl Sensor {
     /// Whether poses have three degrees of freedom.
     pub fn is_planar(self) -> bool {
-        matches!(self, Self::Laser2d | Self::Landmarks2d)
+        match self {
+            Self::Laser2d | Self::Landmarks2d => true,
+            Self::Points3d | Self::Lidar3d | Self::Landmarks => false,
+        }
     }
 
     /// Whether points are landmarks.
     pub fn sees_landmarks(self) -> bool {
-        matches!(self, Self::Landmarks | Self::Landmarks2d)
+        match self {
+            Self::Landmarks | Self::Landmarks2d => true,
+            Self::Points3d | Self::Lidar3d | Self::Laser2d => false,
+        }
     }
 }
 

@@ -12,13 +12,14 @@ use super::continuity::{Continuity, FrameSign};
 use super::gravity::{self, Up};
 use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
 use super::misfit::{Misfits, Views};
+use super::modality::Modality;
 use super::odometry::{across_gap_after, isotropic, motion};
 use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
 use super::runs::Runs;
 use super::thinning::Thinner;
 use super::{Keyframe, KeyframeError, Mark, PlaceDescriptor, PoseWithCovariance};
-use crate::config::{Gravity, Sensor, SubmapConfig};
+use crate::config::{Gravity, SubmapConfig};
 use crate::geometry::{Covariance, Se3};
 use crate::time::Stamp;
 use nalgebra::{Matrix6, Vector3};
@@ -163,10 +164,11 @@ impl SubmapBuilder {
         self.runs.take(keyframe.session);
         let step = self.step(&keyframe);
         let ended = if step.as_ref().is_some_and(|step| self.would_blur(step)) { self.flush() } else { None };
-        self.t_frame_body = match (&step, self.config.sensor) {
-            (Some(step), Sensor::Laser2d) => self.t_frame_body * step.pose,
-            (None, Sensor::Laser2d) | (_, Sensor::Landmarks2d) => flat(&keyframe.pose.pose),
-            (_, Sensor::Points3d | Sensor::Lidar3d | Sensor::Landmarks) => keyframe.pose.pose,
+        let Modality { planar, sharpens, .. } = Modality::of(self.config.sensor);
+        self.t_frame_body = match &step {
+            Some(step) if sharpens => self.t_frame_body * step.pose,
+            _ if planar => flat(&keyframe.pose.pose),
+            _ => keyframe.pose.pose,
         };
         self.track(&keyframe, step);
         self.extend(&keyframe);
@@ -272,20 +274,18 @@ impl SubmapBuilder {
     /// The motion since the last keyframe, if there was one.
     fn step(&mut self, keyframe: &Keyframe) -> Option<PoseWithCovariance> {
         let step = self.last.as_ref().map(|last| motion(last, keyframe, self.gap, &self.config));
-        match self.config.sensor {
-            Sensor::Points3d | Sensor::Lidar3d | Sensor::Landmarks => step,
-            Sensor::Landmarks2d => step.as_ref().map(flat_motion),
-            Sensor::Laser2d => self.sharpener.sharpen(step, &keyframe.points, self.config.voxel_m),
+        match Modality::of(self.config.sensor) {
+            Modality { sharpens: true, .. } => self.sharpener.sharpen(step, &keyframe.points, self.config.voxel_m),
+            Modality { planar: true, .. } => step.as_ref().map(flat_motion),
+            _ => step,
         }
     }
 
     /// How far the frame of the submaps and that of the keyframes drove apart before a restart, at most: where scans
     /// sharpen the motion, the submaps' frame is not the SLAM's.
     fn way_apart(&self) -> f64 {
-        match self.config.sensor {
-            Sensor::Points3d | Sensor::Lidar3d | Sensor::Landmarks | Sensor::Landmarks2d => 0.0,
-            Sensor::Laser2d => f64::from(self.next_index) * self.config.distance_m,
-        }
+        let sharpens = Modality::of(self.config.sensor).sharpens;
+        if sharpens { f64::from(self.next_index) * self.config.distance_m } else { 0.0 }
     }
 
     /// Compounds the motion up to `keyframe` onto the two running poses.
@@ -331,22 +331,18 @@ impl SubmapBuilder {
         open.keyframes.push(t_first_body);
         keyframe.place.iter().for_each(|place| open.place.add(place));
         open.ups.push(up);
-        match self.config.sensor {
-            Sensor::Landmarks => open.landmarks.add(position, &t_first_body, &keyframe.points, &keyframe.marks),
-            Sensor::Landmarks2d => {
-                let (points, marks) = flattened(&keyframe.points, &keyframe.marks);
-                open.landmarks.add(position, &t_first_body, &points, &marks);
-            }
-            Sensor::Points3d | Sensor::Lidar3d | Sensor::Laser2d => {}
+        let Modality { landmarks, planar, bends, .. } = Modality::of(self.config.sensor);
+        if landmarks && planar {
+            let (points, marks) = flattened(&keyframe.points, &keyframe.marks);
+            return open.landmarks.add(position, &t_first_body, &points, &marks);
         }
-        if self.config.sensor.sees_landmarks() {
-            return;
+        if landmarks {
+            return open.landmarks.add(position, &t_first_body, &keyframe.points, &keyframe.marks);
         }
-        if self.config.sensor == Sensor::Points3d {
+        if bends {
             open.views.add(usize::from(position), &t_first_body, &keyframe.points, self.config.voxel_m);
         }
-        let is_flat = self.config.sensor == Sensor::Laser2d;
-        let height = |p: &[f32; 3]| if is_flat { [p[0], p[1], 0.0] } else { *p };
+        let height = |p: &[f32; 3]| if planar { [p[0], p[1], 0.0] } else { *p };
         open.cloud.add(keyframe.points.iter().map(|p| moved(&t_first_body, height(p).map(f64::from))), position);
     }
 

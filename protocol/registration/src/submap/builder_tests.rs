@@ -1,5 +1,6 @@
 use super::super::testing::keyframe;
 use super::*;
+use crate::config::Sensor;
 use crate::geometry::{Covariance, So3};
 use crate::submap::CovarianceOf;
 use nalgebra::Vector6;

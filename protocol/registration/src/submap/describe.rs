@@ -6,12 +6,13 @@ use super::block::Block;
 use super::descriptor::{Code, Projection};
 use super::features::{Codes, FEATURES_MAX, Features, KEYPOINTS_MAX, Keypoints, UNSEEN, VIEWPOINTS_MAX, in_voxels};
 use super::landmarks;
+use super::modality::Modality;
 use super::planar;
 use super::rings;
 use super::sampling::{rest, spread};
 use super::summary::Summary;
 use super::surface::{Normal, normals};
-use crate::config::{Sensor, SubmapConfig};
+use crate::config::SubmapConfig;
 use nalgebra::Vector3;
 
 /// Neighbours that a keypoint needs at least for its descriptor to mean something.
@@ -37,10 +38,10 @@ pub struct Described {
 
 /// Normals, keypoints with descriptors, and summary of a submap.
 pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
-    let described = match config.sensor {
-        Sensor::Points3d | Sensor::Lidar3d => in_space(submap, config),
-        Sensor::Laser2d => planar::describe(submap, config),
-        Sensor::Landmarks | Sensor::Landmarks2d => landmarks::describe(submap, config),
+    let described = match Modality::of(config.sensor) {
+        Modality { landmarks: true, .. } => landmarks::describe(submap, config),
+        Modality { planar: true, .. } => planar::describe(submap, config),
+        _ => in_space(submap, config),
     };
     Described { summary: described.summary.at(submap.place.clone()).upright(submap.up), ..described }
 }

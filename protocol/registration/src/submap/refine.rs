@@ -18,6 +18,7 @@
 use super::block::Surfel;
 use super::cloud::Index;
 use super::features::{Features, Keypoints};
+use super::modality::Modality;
 use super::visibility::contradiction;
 use crate::config::Sensor;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, So3};
@@ -94,9 +95,10 @@ impl Default for RefineConfig {
 impl RefineConfig {
     /// What suits the sensor.
     pub fn of(sensor: Sensor) -> Self {
-        match sensor {
-            Sensor::Lidar3d => Self { independent_max: INDEPENDENT_LIDAR_MAX, bends: false, ..Self::default() },
-            _ => Self::default(),
+        if Modality::of(sensor).ranges {
+            Self { independent_max: INDEPENDENT_LIDAR_MAX, bends: false, ..Self::default() }
+        } else {
+            Self::default()
         }
     }
 }

@@ -12,6 +12,7 @@
 
 use super::descriptor::{Code, Projection};
 use super::gravity::{self, Up};
+use super::modality::Modality;
 use super::place::{self, Place};
 use crate::config::Sensor;
 use thiserror::Error;
@@ -142,7 +143,7 @@ impl Summary {
     /// The same, of what this sensor saw.
     #[must_use]
     pub(super) fn seen_by(self, sensor: Sensor) -> Self {
-        let version = if sensor == Sensor::Lidar3d { RANGES } else { self.version };
+        let version = if Modality::of(sensor).ranges { RANGES } else { self.version };
         Self { version, ..self }
     }
 
