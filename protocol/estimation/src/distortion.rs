@@ -22,12 +22,12 @@
 //! the variance of the walk while it was made (`walk`). So much is added to `C_k`. *Measured* in swarms of stand-in clouds
 //! that drift so (`merganser-sim bench calibration`): without it the submaps' NEES is 1.18 by degrees of freedom. What goes
 //! with the odometry on either side is told to the graph by `bend`, and to who goes on from the map by
-//! [`ends`](super::ends).
+//! [`ends`](super::extrapolation).
 
-use super::bend::{self, Around, Gains};
+use super::admission::Kind;
 use super::graph::{Factor, Label};
-use super::intake::Kind;
 use super::joint::EdgeEstimate;
+use super::odometry_correlation::{self, Around, Gains};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
 use crate::ids::{FrameId, SubmapId};
 use nalgebra::Matrix6;
@@ -108,8 +108,9 @@ pub(super) fn factors<'a>(
     let clouds = clouds(edges, &shared);
     let mut gains = BTreeMap::new();
     let cloud = |(id, common): (&SubmapId, &Covariance<6>)| {
-        let (covariance, of_steps) =
-            odometry(*id).map_or((*common, [None; 2]), |around| bend::owed(common, &around.walk, around.steps));
+        let (covariance, of_steps) = odometry(*id).map_or((*common, [None; 2]), |around| {
+            odometry_correlation::conditional_covariance(common, &around.walk, around.steps)
+        });
         gains.insert(*id, of_steps);
         cloud_factor(*id, &covariance)
     };

@@ -1,11 +1,11 @@
 use super::*;
+use crate::drift_model::DriftModel;
 use crate::geometry::{Se3, SimWithCovariance};
 use crate::ids::EntryId;
 use crate::joint::{AgreedAlignment, JointEstimate};
 use crate::test_graphs::{frame, normal, rng, submap};
 use crate::test_walks::{Walked, walked};
 use crate::test_world::{ALIGNMENT, World, bits, rigid};
-use crate::walk::Walk;
 use nalgebra::{DMatrix, Vector6};
 use rand_chacha::ChaCha8Rng;
 
@@ -148,8 +148,8 @@ fn no_alignment_claims_more_than_it_did() {
 fn a_cloud_lies_off_its_anchor_by_a_twelfth_of_the_walk() {
     let all = [0, 1].map(|k| edge(k, submap(1, 0), submap(2, k as usize), pose(&mut rng(8), 0.01), 0.2));
     let all: Vec<&EdgeEstimate> = all.iter().collect();
-    let walk = Walk { whole: Covariance::from_sigmas([0.6; 6]).unwrap(), keyframes: None };
-    let around = |walk: &Walk| Around { walk: *walk, steps: [None; 2] };
+    let walk = DriftModel { whole: Covariance::from_sigmas([0.6; 6]).unwrap(), keyframes: None };
+    let around = |walk: &DriftModel| Around { walk: *walk, steps: [None; 2] };
     let [none, some] = [None, Some(walk)].map(|walk| covariance(&factors(&all, |_| walk.as_ref().map(around)).0[0]));
     assert!((some - none - Matrix6::from_diagonal_element(0.03)).amax() < 1e-12);
 }

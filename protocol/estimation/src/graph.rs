@@ -5,7 +5,7 @@
 //! (MATH §1: local perturbations), with the exact Jacobians of MATH §2: `∂r/∂δ_j = J_r⁻¹(r)`,
 //! `∂r/∂δ_i = −J_l⁻¹(r) Ad(t_i_j⁻¹)`. Gauge: the smallest [`SubmapId`] of a component is held fixed.
 
-use super::bend::Bend;
+use super::odometry_correlation::Bend;
 use crate::geometry::sim3::{self, Matrix7, Vector7};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, se3};
 use crate::ids::{EntryId, FrameId, SubmapId};

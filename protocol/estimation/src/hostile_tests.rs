@@ -1,6 +1,6 @@
 //! Hostile and broken sets of facts: listed, harmless, never a panic.
 
-use super::intake::{SIGMA_ROTATION_MAX, SIGMA_TRANSLATION_MAX};
+use super::admission::{SIGMA_ROTATION_MAX, SIGMA_TRANSLATION_MAX};
 use super::joint::*;
 use super::position::{SeenPoint, StatedPoint};
 use super::solve::SolveError;

@@ -1,23 +1,23 @@
 //! The map as a pure function of the set of facts: decides which frames merge, which measurements count, and where every
 //! anchor lies (DESIGN §7, MATH §3 and §5).
 //!
-//! 1. `intake` sorts the facts canonically and lists what cannot be used.
+//! 1. `admission` sorts the facts canonically and lists what cannot be used.
 //! 2. `pairs` runs the frame-level consensus on each pair of frames and accepts merges along the strongest spanning
 //!    forest; a pair that contradicts a loop of frames (χ², 99.99 %) is left out.
 //! 3. Here, the whole graph is solved with the alignments that remain (`distortion` knows what they have in common); one whose leave-one-out χ² exceeds 99.9 % is
 //!    dropped, the largest first, and the graph solved again.
 //! 4. Sightings between merged frames, and alignments that no consensus weighed, join if they agree with that map.
 
-use super::among::{JointError, JointPoses};
+use super::admission::{Admission, Kind};
 use super::distortion::{self, Charges};
+use super::drift_model::DriftModel;
 use super::graph::{Factor, Graph, Label};
-use super::intake::{Intake, Kind};
+use super::joint_covariance::{JointError, JointPoses};
 use super::optimality::Optimality;
 use super::pairs::{self, Pair};
 use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
 use super::solve::{Solution, SolveError, solve_within};
-use super::walk::Walk;
 use crate::config::EstimateConfig;
 use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -217,7 +217,7 @@ pub struct JointEstimate {
     /// `t_frame_anchor0`.
     pub(super) origins: BTreeMap<FrameId, PoseWithCovariance>,
     /// The first and the last anchor of each metric frame and the walks while their submaps were made.
-    pub(super) ends: BTreeMap<FrameId, [(SubmapId, Walk); 2]>,
+    pub(super) ends: BTreeMap<FrameId, [(SubmapId, DriftModel); 2]>,
     pub(super) unknown_scale: BTreeSet<FrameId>,
     pairs: Vec<PairEstimate>,
     edges: Vec<EdgeEstimate>,
@@ -233,20 +233,20 @@ pub struct JointEstimate {
 
 /// Solves the map. Never fails: what cannot be used is listed in [`JointEstimate::edges`] with its reason.
 pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate {
-    let mut intake = Intake::new(problem);
-    let mut pairs = pairs::consensus(&mut intake, config);
-    let start = pairs::start(&intake, &pairs);
-    let mut map = Map::solve(&mut intake, &mut pairs, start, config);
-    let unknown_scale = intake.unknown_scale.clone();
+    let mut admission = Admission::new(problem);
+    let mut pairs = pairs::consensus(&mut admission, config);
+    let start = pairs::start(&admission, &pairs);
+    let mut map = Map::solve(&mut admission, &mut pairs, start, config);
+    let unknown_scale = admission.unknown_scale.clone();
     let scales = pairs::sigma_scales(&pairs);
     for _ in 0..ADMISSIONS_MAX {
-        if !intake.admit(&scales, |i, j| map.relative(&unknown_scale, i, j)) {
+        if !admission.admit(&scales, |i, j| map.relative(&unknown_scale, i, j)) {
             break;
         }
-        map = Map::solve(&mut intake, &mut pairs, map.start, config);
+        map = Map::solve(&mut admission, &mut pairs, map.start, config);
     }
-    intake.refuse_waiting(&scales, |i, j| map.relative(&unknown_scale, i, j));
-    JointEstimate::new(intake, pairs, map)
+    admission.refuse_waiting(&scales, |i, j| map.relative(&unknown_scale, i, j));
+    JointEstimate::new(admission, pairs, map)
 }
 
 /// Solved components while measurements are still being dropped.
@@ -259,14 +259,14 @@ struct Map {
 impl Map {
     /// Solves, drops what contradicts the rest, and solves again until nothing does.
     fn solve(
-        intake: &mut Intake,
+        admission: &mut Admission,
         pairs: &mut [Pair],
         mut start: BTreeMap<SubmapId, Sim3>,
         config: &EstimateConfig,
     ) -> Self {
         let mut round = 0;
         loop {
-            let solved = solve_components(intake, &start, config.iterations_max);
+            let solved = solve_components(admission, &start, config.iterations_max);
             let mut changed = false;
             let mut solutions = Vec::new();
             for (frames, solution) in solved {
@@ -274,12 +274,12 @@ impl Map {
                     Ok(solution) => {
                         start.extend(solution.graph().nodes().iter().copied().zip(solution.values().iter().copied()));
                         for Drop { label, chi2 } in reweight::contradictions(&solution, round) {
-                            changed |= intake.drop_edge(label, Unused::Contradicts(chi2));
+                            changed |= admission.drop_edge(label, Unused::Contradicts(chi2));
                         }
                         solutions.push((frames, Ok(solution)));
                     }
                     Err(error) => {
-                        changed |= intake.isolate_worst(&frames, error);
+                        changed |= admission.isolate_worst(&frames, error);
                         solutions.push((frames, Err(error)));
                     }
                 }
@@ -287,8 +287,8 @@ impl Map {
             if !changed {
                 return Self { solutions, start };
             }
-            pairs::demote(intake, pairs, config.alignments_min);
-            intake.drop_strays();
+            pairs::demote(admission, pairs, config.alignments_min);
+            admission.drop_strays();
             round += 1;
         }
     }
@@ -302,20 +302,20 @@ impl Map {
 type Solved = (BTreeSet<FrameId>, Result<Solution, SolveError>);
 
 /// Builds and solves every component from the measurements that count at present.
-fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iterations_max: usize) -> Vec<Solved> {
+fn solve_components(admission: &Admission, start: &BTreeMap<SubmapId, Sim3>, iterations_max: usize) -> Vec<Solved> {
     let mut groups: BTreeMap<usize, BTreeSet<FrameId>> = BTreeMap::new();
-    for (frame, group) in intake.groups() {
+    for (frame, group) in admission.groups() {
         groups.entry(group).or_default().insert(frame);
     }
-    let used = || intake.edges.iter().filter(|e| e.is_used());
+    let used = || admission.edges.iter().filter(|e| e.is_used());
     let solve_group = |members: BTreeSet<FrameId>| {
-        let mut nodes: BTreeSet<SubmapId> = members.iter().flat_map(|f| intake.chains[f].ids(*f)).collect();
-        let mut factors: Vec<Factor> = members.iter().flat_map(|f| intake.chains[f].factors(*f)).collect();
+        let mut nodes: BTreeSet<SubmapId> = members.iter().flat_map(|f| admission.chains[f].ids(*f)).collect();
+        let mut factors: Vec<Factor> = members.iter().flat_map(|f| admission.chains[f].factors(*f)).collect();
         let tied: Vec<&EdgeEstimate> = used().filter(|e| members.contains(&e.measurement.i.frame)).collect();
-        let (tied, gains) = distortion::factors(&tied, |id| intake.around(id));
+        let (tied, gains) = distortion::factors(&tied, |id| admission.around(id));
         factors.extend(tied);
         nodes.extend(factors.iter().filter(|factor| factor.label == Label::Cloud).map(|factor| factor.j));
-        let solution = match Graph::components(&nodes, &intake.unknown_scale, factors) {
+        let solution = match Graph::components(&nodes, &admission.unknown_scale, factors) {
             Ok(mut graphs) if graphs.len() == 1 => {
                 let mut graph = graphs.remove(0);
                 graph.bend(&gains);
@@ -324,7 +324,7 @@ fn solve_components(intake: &Intake, start: &BTreeMap<SubmapId, Sim3>, iteration
                 let start = start.collect();
                 solve_within(graph, start, iterations_max, MAP_BYTES_MAX).map_err(|e| e.renamed(distortion::anchor_of))
             }
-            // Intake admits only what a graph accepts, and a chain is connected.
+            // Admission admits only what a graph accepts, and a chain is connected.
             _ => Err(SolveError::NotFinite),
         };
         (members, solution)
@@ -374,10 +374,10 @@ impl EdgeEstimate {
 }
 
 impl JointEstimate {
-    fn new(intake: Intake, pairs: Vec<Pair>, map: Map) -> Self {
-        let origins = intake.chains.iter().map(|(&f, chain)| (f, chain.origin)).collect();
-        let metric = intake.chains.iter().filter(|(f, _)| !intake.unknown_scale.contains(f));
-        let ends = metric.filter_map(|(&f, _)| Some((f, intake.ends(f)?))).collect();
+    fn new(admission: Admission, pairs: Vec<Pair>, map: Map) -> Self {
+        let origins = admission.chains.iter().map(|(&f, chain)| (f, chain.origin)).collect();
+        let metric = admission.chains.iter().filter(|(f, _)| !admission.unknown_scale.contains(f));
+        let ends = metric.filter_map(|(&f, _)| Some((f, admission.ends(f)?))).collect();
         let mut components = Vec::new();
         let mut component_of = BTreeMap::new();
         for (frames, solution) in map.solutions {
@@ -388,15 +388,15 @@ impl JointEstimate {
         let mut out = Self {
             chi2: solutions().map(|s| s.chi2).sum(),
             dof: solutions().map(|s| s.dof).sum(),
-            nodes: intake.chains.values().map(|c| c.len()).sum(),
+            nodes: admission.chains.values().map(|c| c.len()).sum(),
             converged: components.iter().all(|c| c.solution.as_ref().is_ok_and(|s| s.converged)),
             components,
             component_of,
             origins,
             ends,
-            unknown_scale: intake.unknown_scale,
+            unknown_scale: admission.unknown_scale,
             pairs: Vec::new(),
-            edges: intake.edges,
+            edges: admission.edges,
         };
         out.pairs = pairs.into_iter().map(|pair| pair.estimate(&out)).collect();
         out

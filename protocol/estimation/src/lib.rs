@@ -1,19 +1,20 @@
 //! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
 
-pub mod among;
-mod bend;
+mod admission;
 pub mod certificate;
 pub mod chordal;
 pub mod distortion;
-pub mod ends;
+mod drift_model;
+pub mod extrapolation;
 pub mod frames;
 pub mod graph;
 pub mod incremental;
-mod intake;
 pub mod joint;
+pub mod joint_covariance;
 mod loops;
 pub mod marginals;
 mod minimise;
+mod odometry_correlation;
 pub mod optimality;
 mod pairs;
 #[cfg(test)]
@@ -21,18 +22,17 @@ mod pairs_tests;
 mod places;
 pub mod posegraph;
 pub mod position;
+mod relative_odometry;
 pub mod residual;
 mod reweight;
 pub mod solve;
 mod sparse;
 pub mod trajectory;
-mod walk;
-mod ways;
 
 use merganser_geometry as geometry;
 use merganser_types::{config, ids, kinds};
 
-pub use intake::Kind as EdgeKind;
+pub use admission::Kind as EdgeKind;
 pub use joint::{
     AgreedAlignment, EdgeEstimate, FrameChain, JointEstimate, MapProblem, PairEstimate, Unused, solve_map,
 };

@@ -4,11 +4,11 @@
 //! the odometry that joins their ends (pairwise consistency, Mangelson et al. 2018, with odometry segments taken as
 //! independent; of many, each with a fixed number of others, so that the cost grows with their number). Of closures that contradict each other, the one with the most contradictions goes first.
 
-use super::intake::{Intake, Kind};
+use super::admission::{Admission, Kind};
 use super::joint::Unused;
+use super::relative_odometry::{OdometryStep, RelativeOdometry, compose, inverse};
 use super::reweight::CHI2_999;
 use super::trajectory::Trajectory;
-use super::ways::{Way, Ways, compose, inverse};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3};
 use crate::ids::FrameId;
 use std::collections::BTreeMap;
@@ -62,10 +62,10 @@ pub(super) struct Loops {
 }
 
 /// Sets aside the loop closures that do not hold, and tells of each frame what became of them.
-pub(super) fn gate(intake: &mut Intake) -> BTreeMap<FrameId, Loops> {
+pub(super) fn gate(admission: &mut Admission) -> BTreeMap<FrameId, Loops> {
     let mut loops = BTreeMap::new();
     let mut by_frame: BTreeMap<FrameId, Vec<Closure>> = BTreeMap::new();
-    for (edge, e) in intake.edges.iter().enumerate() {
+    for (edge, e) in admission.edges.iter().enumerate() {
         let m = &e.measurement;
         if e.kind != Kind::Alignment || e.unused.is_some() || m.i.frame != m.j.frame {
             continue;
@@ -78,8 +78,8 @@ pub(super) fn gate(intake: &mut Intake) -> BTreeMap<FrameId, Loops> {
         by_frame.entry(m.i.frame).or_default().push(closure);
     }
     for (frame, mut closures) in by_frame {
-        let chain = &intake.chains[&frame];
-        let is_metric = !intake.unknown_scale.contains(&frame);
+        let chain = &admission.chains[&frame];
+        let is_metric = !admission.unknown_scale.contains(&frame);
         let (mut refused, mut refuted, driven) = (Vec::new(), 0, driven_to(&chain.trajectory));
         closures.retain(|c| {
             let odometry = chain.trajectory.relative(c.i, c.j);
@@ -95,7 +95,7 @@ pub(super) fn gate(intake: &mut Intake) -> BTreeMap<FrameId, Loops> {
         loops.insert(frame, Loops { held: closures.len() - outvoted.len(), refuted });
         refused.extend(outvoted.into_iter().map(|edge| (edge, Unused::OtherLoops)));
         for (edge, reason) in refused {
-            intake.edges[edge].refuse(reason);
+            admission.edges[edge].refuse(reason);
         }
     }
     loops
@@ -105,7 +105,7 @@ pub(super) fn gate(intake: &mut Intake) -> BTreeMap<FrameId, Loops> {
 fn outvoted(trajectory: &Trajectory, closures: &[Closure]) -> Vec<usize> {
     let n = closures.len().min(CLOSURES_COMPARED_MAX);
     let mut conflicts = vec![Vec::new(); n];
-    let ways = Ways::new(trajectory, closures[..n].iter().flat_map(|c| [c.i, c.j]));
+    let ways = RelativeOdometry::new(trajectory, closures[..n].iter().flat_map(|c| [c.i, c.j]));
     for (l, closure) in closures[..n].iter().enumerate() {
         let around = Around::of(closure, &ways);
         for m in compared(n, l) {
@@ -140,17 +140,17 @@ fn compared(n: usize, l: usize) -> impl Iterator<Item = usize> {
 /// A closure, and the odometry from its ends to where others stand.
 struct Around<'a> {
     closure: &'a Closure,
-    from_i: Vec<Way>,
-    from_j: Vec<Way>,
+    from_i: Vec<OdometryStep>,
+    from_j: Vec<OdometryStep>,
 }
 
 impl<'a> Around<'a> {
-    fn of(closure: &'a Closure, ways: &Ways) -> Self {
+    fn of(closure: &'a Closure, ways: &RelativeOdometry) -> Self {
         let from = |anchor| ways.from(ways.slot(anchor));
         Self { closure, from_i: from(closure.i), from_j: from(closure.j) }
     }
 
-    fn agrees_with(&self, other: &Closure, ways: &Ways) -> bool {
+    fn agrees_with(&self, other: &Closure, ways: &RelativeOdometry) -> bool {
         let there = self.from_i.get(ways.slot(other.i)).zip(self.from_j.get(ways.slot(other.j)));
         there.is_some_and(|(out, back)| {
             let along = (other.t_i_j.pose, *other.t_i_j.covariance.matrix());

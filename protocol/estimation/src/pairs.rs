@@ -5,8 +5,8 @@
 //! pair that closes a loop of frames must agree with the stronger pairs around it (χ², 99.99 %), or it is left out: a
 //! false merge is worse than a missing one.
 
+use super::admission::{Admission, Chain};
 use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
-use super::intake::{Chain, Intake};
 use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
 use super::loops::{self, Loops};
 use super::marginals::is_rigid;
@@ -33,7 +33,7 @@ const REPEATED_MIN: usize = 2;
 pub(super) struct Pair {
     pub(super) a: FrameId,
     pub(super) b: FrameId,
-    /// Its alignments among the intake's edges.
+    /// Its alignments among the admission's edges.
     members: Vec<usize>,
     /// Those among them that the consensus weighed.
     weighed: Vec<usize>,
@@ -57,13 +57,13 @@ pub(super) struct Outcome {
     pub(super) t_a_b: Option<Relative>,
 }
 
-/// Runs the consensus on every pair, and marks the intake's edges accordingly.
-pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pair> {
-    let loops = loops::gate(intake);
-    let repeat = repeating(&loops, &intake.ambiguous);
+/// Runs the consensus on every pair, and marks the admission's edges accordingly.
+pub(super) fn consensus(admission: &mut Admission, config: &EstimateConfig) -> Vec<Pair> {
+    let loops = loops::gate(admission);
+    let repeat = repeating(&loops, &admission.ambiguous);
     let mut members: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
     let mut second: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
-    for (k, edge) in intake.edges.iter().enumerate() {
+    for (k, edge) in admission.edges.iter().enumerate() {
         let (i, j) = (edge.measurement.i.frame, edge.measurement.j.frame);
         let list = match edge.unused {
             None if edge.merges() => &mut members,
@@ -75,9 +75,9 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
         }
     }
     let mut pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
-        let weighed = weighed(intake, (a, b), &members, config);
-        let outcome = decide(intake, (a, b), &weighed, config);
-        let ambiguous = intake.ambiguous.get(&(a, b)).copied().unwrap_or(0);
+        let weighed = weighed(admission, (a, b), &members, config);
+        let outcome = decide(admission, (a, b), &weighed, config);
+        let ambiguous = admission.ambiguous.get(&(a, b)).copied().unwrap_or(0);
         let outcome = if repeat.contains(&a) || repeat.contains(&b) {
             outcome.unless_merged()
         } else {
@@ -88,9 +88,9 @@ pub(super) fn consensus(intake: &mut Intake, config: &EstimateConfig) -> Vec<Pai
     };
     let mut pairs: Vec<Pair> = members.into_iter().map(&mut pair).collect();
     for pair in &pairs {
-        pair.mark(intake);
+        pair.mark(admission);
     }
-    span(intake, &mut pairs);
+    span(admission, &mut pairs);
     pairs
 }
 
@@ -111,11 +111,11 @@ fn repeating(loops: &BTreeMap<FrameId, Loops>, ambiguous: &BTreeMap<(FrameId, Fr
 /// `t_world_anchor` of every anchor: odometry, laid out along the spanning forest. Where a tree holds a frame in metres the
 /// world is in metres, and so are all such frames, also those reached through one of unknown scale: what the way there
 /// says of a scale is not exact, and no later step could put it right.
-pub(super) fn start(intake: &Intake, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3> {
+pub(super) fn start(admission: &Admission, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3> {
     let forest = Forest::of(pairs);
     let mut world: BTreeMap<FrameId, Sim3> = BTreeMap::new();
-    let is_metric = |frame: &FrameId| !intake.unknown_scale.contains(frame);
-    let (metric, unknown): (Vec<FrameId>, Vec<FrameId>) = intake.chains.keys().partition(|&frame| is_metric(frame));
+    let is_metric = |frame: &FrameId| !admission.unknown_scale.contains(frame);
+    let (metric, unknown): (Vec<FrameId>, Vec<FrameId>) = admission.chains.keys().partition(|&frame| is_metric(frame));
     for root in metric.into_iter().chain(unknown) {
         if !world.contains_key(&root) {
             for (reached, t_root_reached) in forest.reach(root) {
@@ -133,28 +133,28 @@ pub(super) fn start(intake: &Intake, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3>
         };
         chain.ids(frame).filter_map(place).collect::<Vec<_>>()
     };
-    intake.chains.iter().flat_map(anchors).collect()
+    admission.chains.iter().flat_map(anchors).collect()
 }
 
 /// Undoes merges of which too few alignments survive.
-pub(super) fn demote(intake: &mut Intake, pairs: &mut [Pair], alignments_min: usize) {
+pub(super) fn demote(admission: &mut Admission, pairs: &mut [Pair], alignments_min: usize) {
     for pair in pairs.iter_mut().filter(|p| p.outcome.status == PairStatus::Merged) {
-        if used(&pair.members, &intake.edges) < alignments_min {
+        if used(&pair.members, &admission.edges) < alignments_min {
             pair.outcome.status = PairStatus::Inconsistent;
-            pair.refuse(intake, Unused::TooFew);
+            pair.refuse(admission, Unused::TooFew);
         }
     }
 }
 
 impl Pair {
     /// Sets weights and reasons of the pair's alignments after the consensus.
-    fn mark(&self, intake: &mut Intake) {
+    fn mark(&self, admission: &mut Admission) {
         for &edge in &self.members {
-            intake.edges[edge].refuse(Unused::Waiting);
-            intake.edges[edge].joins = self.outcome.status == PairStatus::Merged;
+            admission.edges[edge].refuse(Unused::Waiting);
+            admission.edges[edge].joins = self.outcome.status == PairStatus::Merged;
         }
         for (k, &edge) in self.weighed.iter().enumerate() {
-            let edge = &mut intake.edges[edge];
+            let edge = &mut admission.edges[edge];
             edge.unused = None;
             if self.outcome.status != PairStatus::Merged {
                 edge.refuse(Unused::Unmerged(self.outcome.status));
@@ -169,11 +169,11 @@ impl Pair {
         }
     }
 
-    fn refuse(&self, intake: &mut Intake, reason: Unused) {
+    fn refuse(&self, admission: &mut Admission, reason: Unused) {
         for &k in &self.members {
-            intake.edges[k].joins = false;
-            if intake.edges[k].is_used() {
-                intake.edges[k].refuse(reason);
+            admission.edges[k].joins = false;
+            if admission.edges[k].is_used() {
+                admission.edges[k].refuse(reason);
             }
         }
     }
@@ -198,15 +198,20 @@ fn used(of: &[usize], edges: &[EdgeEstimate]) -> usize {
 
 /// At most [`WEIGHED_MAX`] of a pair's alignments: the most promising where units are equal, else evenly from first to
 /// last in canonical order.
-fn weighed(intake: &Intake, (a, b): (FrameId, FrameId), members: &[usize], config: &EstimateConfig) -> Vec<usize> {
+fn weighed(
+    admission: &Admission,
+    (a, b): (FrameId, FrameId),
+    members: &[usize],
+    config: &EstimateConfig,
+) -> Vec<usize> {
     if members.len() <= WEIGHED_MAX {
         return members.to_vec();
     }
-    let oriented = members.iter().map(|&k| orient(&intake.edges[k], a));
+    let oriented = members.iter().map(|&k| orient(&admission.edges[k], a));
     let metric = oriented.map(|(i, j, t)| t.metric().map(|&t_i_j| PairAlignment { i, j, t_i_j }));
     match metric.collect::<Option<Vec<_>>>() {
-        Some(alignments) if is_rigid(a, b, &intake.unknown_scale) => {
-            let (alpha, beta) = (&intake.chains[&a].trajectory, &intake.chains[&b].trajectory);
+        Some(alignments) if is_rigid(a, b, &admission.unknown_scale) => {
+            let (alpha, beta) = (&admission.chains[&a].trajectory, &admission.chains[&b].trajectory);
             let chosen = promising(alpha, beta, &alignments, &FrameConsensusConfig::from(config), WEIGHED_MAX);
             chosen.into_iter().map(|k| members[k]).collect()
         }
@@ -221,7 +226,7 @@ pub(super) fn sigma_scales(pairs: &[Pair]) -> BTreeMap<(FrameId, FrameId), f64> 
 }
 
 /// Takes merged pairs into the forest, the strongest first, and leaves out those that contradict a loop.
-fn span(intake: &mut Intake, pairs: &mut [Pair]) {
+fn span(admission: &mut Admission, pairs: &mut [Pair]) {
     let mut order: Vec<usize> = (0..pairs.len()).collect();
     let nfa = |k: usize| pairs[k].outcome.log10_nfa.unwrap_or(f64::INFINITY);
     order.retain(|&k| pairs[k].outcome.status == PairStatus::Merged);
@@ -235,7 +240,7 @@ fn span(intake: &mut Intake, pairs: &mut [Pair]) {
             Some(_) => {
                 pairs[k].contradicts_loop = true;
                 pairs[k].outcome.status = PairStatus::Inconsistent;
-                pairs[k].refuse(intake, Unused::FrameLoop);
+                pairs[k].refuse(admission, Unused::FrameLoop);
             }
         }
     }
@@ -280,11 +285,11 @@ impl Forest {
 }
 
 /// The frame-level consensus of one pair, in SE(3) or SIM(3) as its units ask.
-fn decide(intake: &Intake, (a, b): (FrameId, FrameId), members: &[usize], config: &EstimateConfig) -> Outcome {
-    let (alpha, beta) = (&intake.chains[&a].trajectory, &intake.chains[&b].trajectory);
-    let oriented = members.iter().map(|&k| orient(&intake.edges[k], a));
+fn decide(admission: &Admission, (a, b): (FrameId, FrameId), members: &[usize], config: &EstimateConfig) -> Outcome {
+    let (alpha, beta) = (&admission.chains[&a].trajectory, &admission.chains[&b].trajectory);
+    let oriented = members.iter().map(|&k| orient(&admission.edges[k], a));
     let config = FrameConsensusConfig::from(config);
-    if is_rigid(a, b, &intake.unknown_scale) {
+    if is_rigid(a, b, &admission.unknown_scale) {
         let metric = |(i, j, t): (_, _, Relative)| t.metric().map(|&t_i_j| PairAlignment { i, j, t_i_j });
         let alignments: Vec<_> = oriented.filter_map(metric).collect();
         Outcome::of(align_frames(alpha, beta, &alignments, &config), Relative::Metric)

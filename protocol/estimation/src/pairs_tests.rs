@@ -1,6 +1,6 @@
 //! Which frames merge: what speaks for it, what against, and what for neither.
 
-use super::intake::Intake;
+use super::admission::Admission;
 use super::joint::*;
 use super::pairs;
 use super::test_graphs::*;
@@ -142,14 +142,14 @@ fn what_merges_nothing_does_not_hold_together_what_falls_apart() {
         world.problem.alignments.iter().filter(|one| of_ends(one) == (a, b)).map(|one| one.entry).collect();
     let second_looks = between[2..].iter().copied().collect();
     let problem = MapProblem { second_looks, ..world.problem.clone() };
-    let mut intake = Intake::new(&problem);
-    let mut pairs = pairs::consensus(&mut intake, &EstimateConfig::default());
-    intake.edges.iter_mut().for_each(|edge| edge.unused = None);
-    intake.edges.iter_mut().find(|e| of_ends(&e.measurement) == (a, c)).unwrap().refuse(Unused::Contradicts(1e3));
-    pairs::demote(&mut intake, &mut pairs, 3);
-    intake.drop_strays();
+    let mut admission = Admission::new(&problem);
+    let mut pairs = pairs::consensus(&mut admission, &EstimateConfig::default());
+    admission.edges.iter_mut().for_each(|edge| edge.unused = None);
+    admission.edges.iter_mut().find(|e| of_ends(&e.measurement) == (a, c)).unwrap().refuse(Unused::Contradicts(1e3));
+    pairs::demote(&mut admission, &mut pairs, 3);
+    admission.drop_strays();
     let of = |x, y| {
-        let of_pair = intake.edges.iter().filter(move |e| of_ends(&e.measurement) == (x, y));
+        let of_pair = admission.edges.iter().filter(move |e| of_ends(&e.measurement) == (x, y));
         of_pair.map(|e| e.unused).collect::<Vec<_>>()
     };
     assert_eq!(of(a, c), [Some(Unused::Contradicts(1e3)), Some(Unused::TooFew), Some(Unused::TooFew)]);

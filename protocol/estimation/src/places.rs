@@ -1,12 +1,12 @@
 //! Where anchors and origins lie in a frame's own coordinates. A frame's origin hangs on its first anchor alone, and bodies on
-//! their last; what their errors have to do with the map's is told by [`ends`](super::ends).
+//! their last; what their errors have to do with the map's is told by [`ends`](super::extrapolation).
 
 use super::distortion;
-use super::ends::End;
+use super::drift_model::DriftModel;
+use super::extrapolation::End;
 use super::joint::JointEstimate;
 use super::marginals::certain;
 use super::solve::Solution;
-use super::walk::Walk;
 use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{FrameId, SubmapId};
 use nalgebra::Matrix6;
@@ -61,7 +61,7 @@ impl JointEstimate {
         let solution = self.solution_of(reference, reference).filter(|_| !self.unknown_scale.contains(&reference));
         let Some(solution) = solution else { return BTreeMap::new() };
         let together = self.ends.iter().filter(|(frame, _)| self.component_of(**frame) == self.component_of(reference));
-        let end = |(_, [_, (last, walk)]): (_, &[(SubmapId, Walk); 2])| {
+        let end = |(_, [_, (last, walk)]): (_, &[(SubmapId, DriftModel); 2])| {
             let seen_from = |solution: &Solution| solution.covariance_with_cloud(first_of(reference), *last);
             Some((*last, End::of(solution, *last, walk.after_anchor()?, seen_from)?))
         };

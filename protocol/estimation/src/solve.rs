@@ -3,9 +3,9 @@
 //! The result depends on the graph and the start alone; the start is made from the same set of facts, never from an
 //! earlier estimate.
 
-use super::bend::Bent;
 use super::graph::{Edge, Graph};
 use super::minimise::{Minimum, Normal, Objective, minimise};
+use super::odometry_correlation::Bent;
 use super::sparse::{BlockPattern, Factor, Slot};
 use crate::geometry::{Se3, Sim3, se3};
 use crate::ids::{FrameId, SubmapId};

@@ -6,7 +6,7 @@ use super::io::{Event, JobId};
 use super::job::{AlignJob, Job, Look, Measured, NotAligned};
 use super::knowledge::{Agreement, Knowledge, Known, Pair, pair_of};
 use super::negotiation::{FETCHES_MAX, Fetch, LOOKALIKES_MAX, LOOP_GAP, Negotiation, Purpose, VERIFICATIONS_MAX, Work};
-use super::promise::Guess;
+use super::overlap_model::Prediction;
 use super::ranking::Proposal;
 use super::shortlist::Candidate;
 use crate::config::AlignConfig;
@@ -25,7 +25,7 @@ const FETCH_AGAIN: Duration = Duration::from_millis(500);
 impl Agent {
     /// A fact has taken effect: what does it call for?
     pub(super) fn on_fact(&mut self, id: EntryId, fact: &Fact) {
-        self.negotiation.stir();
+        self.negotiation.mark_dirty();
         match fact {
             Fact::Submap(fact) => self.note_candidates(SubmapId { frame: id.frame, index: fact.index }),
             Fact::Alignment(fact) => self.note_verification(id, fact),
@@ -55,7 +55,7 @@ impl Agent {
     pub(super) fn note_all_candidates(&mut self) {
         let looks = Looks { me: self.me.robot, knowledge: &self.knowledge, config: &self.config.align };
         looks.pair_up(&mut self.negotiation, &looks.ours(), self.knowledge.submaps());
-        self.negotiation.stir();
+        self.negotiation.mark_dirty();
     }
 
     /// Somebody aligned one of our submaps: we owe an answer, once.
@@ -65,7 +65,7 @@ impl Agent {
             return;
         }
         self.negotiation.mark_tried((fact.i, fact.j));
-        self.negotiation.wishes.remove((fact.i, fact.j));
+        self.negotiation.peer_requests.remove((fact.i, fact.j));
         let ours = fact.i.frame.robot == self.me.robot || fact.j.frame.robot == self.me.robot;
         let owed = ours && id.frame.robot != self.me.robot && !self.knowledge.has_verdict(id, self.me.robot);
         if owed {
@@ -142,7 +142,7 @@ impl Agent {
 
     fn start_proposing(&mut self, active: &[Proposal]) {
         self.negotiation.begun.retain(|begun| active.iter().any(|p| pair_of(p.mine, p.theirs) == *begun));
-        for &Proposal { mine, theirs, may_wait, bytes, guess, further } in active {
+        for &Proposal { mine, theirs, may_wait, bytes, prediction, further } in active {
             if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
                 break;
             }
@@ -160,7 +160,7 @@ impl Agent {
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
             let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);
             let lacks = ours.any(|id| self.negotiation.features(id).is_none());
-            if lacks || self.start_alignment(mine, theirs, Purpose::Propose(guess), further) {
+            if lacks || self.start_alignment(mine, theirs, Purpose::Propose(prediction), further) {
                 self.negotiation.mark_tried(pair);
             }
         }
@@ -311,7 +311,7 @@ impl Agent {
 
     pub(super) fn on_aligned(&mut self, job: JobId, outcome: Result<Box<Measured>, NotAligned>) {
         let Some(work) = self.negotiation.running.remove(&job) else { return };
-        self.negotiation.stir();
+        self.negotiation.mark_dirty();
         let agrees = outcome.as_ref().map_or(Some(true), |found| self.agrees_with_map(&work, &found.t_mine_theirs));
         let outcome = match agrees {
             Some(true) => outcome,
@@ -320,13 +320,13 @@ impl Agent {
         };
         self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
         match work.purpose {
-            Purpose::Propose(guess) => {
-                self.tell_try(&work, guess, outcome.is_ok());
+            Purpose::Propose(prediction) => {
+                self.tell_try(&work, prediction, outcome.is_ok());
                 match outcome {
                     Ok(measured) => self.propose(&work, &measured),
                     Err(why) => {
                         self.note_refusal(pair_of(work.mine, work.theirs));
-                        self.note_second_look(&work, guess, why.reason);
+                        self.note_second_look(&work, prediction, why.reason);
                         self.note_lookalike(&work, why);
                     }
                 }
@@ -361,14 +361,14 @@ impl Agent {
         }
     }
 
-    fn tell_try(&mut self, work: &Work, guess: Guess, found: bool) {
+    fn tell_try(&mut self, work: &Work, prediction: Prediction, found: bool) {
         let (i, j) = pair_of(work.mine, work.theirs);
         if work.further.is_some() {
             self.stats.worked(if found { "second_look_aligned" } else { "second_look_refused" });
             return self.event(Event::LookedAgain { i, j, found });
         }
-        self.negotiation.promise.learn(&guess.signs, found);
-        self.event(Event::AlignmentTried { i, j, expected: guess.probability, found });
+        self.negotiation.overlap_model.learn(&prediction.features, found);
+        self.event(Event::AlignmentTried { i, j, expected: prediction.probability, found });
     }
 
     /// A second look of which our map cannot say any more whether it agrees: an answer that is owed waits until it can.
@@ -403,12 +403,12 @@ impl Agent {
         let reachable = |pair: &Pair| [pair.0, pair.1].iter().any(|id| self.gossip.spread.is_neighbour(id.frame.robot));
         let best = self
             .negotiation
-            .wishes
+            .peer_requests
             .iter()
             .filter(|(pair, _)| reachable(pair) && !self.are_connected(pair.0, pair.1))
             .max_by(|a, b| a.1.similarity.value.total_cmp(&b.1.similarity.value).then(b.0.cmp(&a.0)))
             .map(|(pair, _)| pair)?;
-        self.negotiation.wishes.remove(best);
+        self.negotiation.peer_requests.remove(best);
         Some(best)
     }
 }
@@ -449,7 +449,7 @@ impl Looks<'_> {
                 if Negotiation::responsible(pair) == self.me || mine.frame.robot == theirs.frame.robot {
                     negotiation.add_candidate(candidate, limit);
                 } else {
-                    negotiation.wishes.offer(candidate, limit);
+                    negotiation.peer_requests.offer(candidate, limit);
                 }
                 least = wanted(negotiation);
             }

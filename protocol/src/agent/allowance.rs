@@ -1,6 +1,6 @@
 //! What may be spent on knowing better what is known already: frames that have merged are aligned further at a steady cost
 //! in bytes, whatever the gain, so that a robot that drives for hours does not fill its radio. Merging itself need not
-//! wait, but is paid for out of the same purse. Whoever proposes a pair pays, before anything moves, for what both ends
+//! wait, but is paid for out of the same budget. Whoever proposes a pair pays, before anything moves, for what both ends
 //! will send.
 
 use crate::gossip::Bucket;

@@ -10,7 +10,7 @@ use super::ledger::BATCHES_WAITING_MAX;
 use super::recent::Recent;
 use super::traffic::{Traffic, is_piece};
 use crate::config::GossipConfig;
-use crate::gossip::{Answer, Class, Spread, Step};
+use crate::gossip::{Answer, AntiEntropy, Class, Step};
 use crate::ids::{Hash, RobotId, SubmapId};
 use crate::time::{Instant, Stamp};
 use crate::wire::limits::BLOB_PIECE_LEN;
@@ -28,7 +28,7 @@ const WISH_EVERY: Duration = Duration::from_secs(2);
 
 /// What the gossip remembers.
 pub(super) struct Gossip {
-    pub(super) spread: Spread,
+    pub(super) spread: AntiEntropy,
     pub(super) traffic: Traffic,
     beacons: BTreeMap<RobotId, SeenBeacon>,
     blobs: Recent<Vec<u8>>,
@@ -59,7 +59,7 @@ enum About {
 impl Gossip {
     pub(super) fn new(me: RobotId, config: &GossipConfig, now: Instant) -> Self {
         Self {
-            spread: Spread::new(me, config.have_secs, config.answer_secs, now),
+            spread: AntiEntropy::new(me, config.have_secs, config.answer_secs, now),
             traffic: Traffic::new(config.link_bytes_per_sec, now),
             beacons: BTreeMap::new(),
             blobs: Recent::default(),
@@ -198,7 +198,7 @@ impl Agent {
         }
         if self.gossip.spread.on_neighbour(self.now, robot, up, &mut self.rng) && up {
             self.negotiation.out_of_reach.clear();
-            self.negotiation.stir();
+            self.negotiation.mark_dirty();
         }
     }
 

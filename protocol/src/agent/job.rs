@@ -4,13 +4,13 @@
 use super::two_sided;
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
-use crate::estimate::ends::End;
+use crate::estimate::extrapolation::End;
 use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, Shortfall, Unused, solve_map};
 use crate::estimate::optimality::Optimality;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use crate::submap::landmarks::{self, LandmarkConfig, LandmarkError};
-use crate::submap::planar::FlatConfig;
+use crate::submap::planar::PlanarConfig;
 use crate::submap::{
     self, Described, Features, Keypoints, RefineConfig, RefineError, RegisterConfig, RegisterError, Registered, Submap,
     Verticals,
@@ -273,7 +273,7 @@ impl AlignJob {
     ) -> Result<Measured, NotAligned> {
         match (self.sensor, self.scale) {
             (Sensor::Laser2d, ScaleKind::Metric) => {
-                self.measured(submap::planar::register(theirs, mine, &FlatConfig::default()))
+                self.measured(submap::planar::register(theirs, mine, &PlanarConfig::default()))
             }
             // In the plane nobody tells a scale.
             (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput.into()),
@@ -314,7 +314,7 @@ impl AlignJob {
 
     fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, NotAligned> {
         let found = found.map_err(|error| match error {
-            RegisterError::Ambiguous { elsewhere, .. } | RegisterError::Lookalike { elsewhere, .. } => {
+            RegisterError::Ambiguous { elsewhere, .. } | RegisterError::Aliased { elsewhere, .. } => {
                 NotAligned { reason: RefusalReason::Ambiguous, elsewhere }
             }
             RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. } => RefusalReason::NoConsensus.into(),

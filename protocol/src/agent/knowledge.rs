@@ -64,7 +64,7 @@ pub struct Known {
 
 /// What the joint estimate is to be a function of.
 #[derive(Clone, Debug)]
-pub struct Question {
+pub struct EstimationInput {
     /// The frames that are tied to others or within themselves, our own, and what ties them.
     pub problem: MapProblem,
     /// Frames that nothing ties to anything, and how many anchors each has: their odometry is all there is to say.
@@ -272,7 +272,11 @@ impl Knowledge {
 
     /// The estimation problem: one agreed alignment per pair, all sightings, and the unbroken chain of submaps of every
     /// frame they tie, and of `own`. `odometry` reads `t_prev_this` from where a submap's fact is held.
-    pub fn question(&self, own: FrameId, mut odometry: impl FnMut(&Known) -> Option<PoseWithCovariance>) -> Question {
+    pub fn question(
+        &self,
+        own: FrameId,
+        mut odometry: impl FnMut(&Known) -> Option<PoseWithCovariance>,
+    ) -> EstimationInput {
         let chains = self.chains();
         let place = |id: SubmapId| {
             let index = chains.get(&id.frame)?.binary_search(&id.index).ok()?;
@@ -323,7 +327,7 @@ impl Knowledge {
             chains.into_iter().partition(|(frame, _)| tied.contains(frame));
         let gaps =
             posed.into_iter().filter(|(_, chain)| chain.last().is_some_and(|last| *last as usize >= chain.len()));
-        Question {
+        EstimationInput {
             problem: MapProblem {
                 gone,
                 keyframes,

@@ -192,7 +192,7 @@ impl Agent {
         let later = self.ledger.waiting.split_off(&up_to.saturating_add(1));
         let durable = core::mem::replace(&mut self.ledger.waiting, later);
         if core::mem::take(&mut self.ledger.fails) {
-            self.negotiation.stir();
+            self.negotiation.mark_dirty();
             self.event(Event::StoreHealed);
         }
         let mut own = Vec::new();

@@ -4,7 +4,7 @@
 //! A robot is where its anchor is, by the estimate, and by that anchor where its beacon says. The anchors of two robots
 //! are correlated, as whatever ties both of them to a third moves both alike: so their relation is asked of the estimate
 //! itself, and never made of two poses in our frame (MATH §3). The beacons are independent of one another; in relations of
-//! two robots they are taken to be so of the estimate too, which is cautious ([`ends`](crate::estimate::ends)).
+//! two robots they are taken to be so of the estimate too, which is cautious ([`ends`](crate::estimate::extrapolation)).
 
 use super::Agent;
 use super::knowledge::Gaps;

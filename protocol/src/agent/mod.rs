@@ -22,7 +22,7 @@ mod ledger;
 mod live;
 mod mapping;
 mod negotiation;
-mod promise;
+mod overlap_model;
 mod ranking;
 mod recent;
 mod refusals;

@@ -10,7 +10,7 @@
 
 use super::io::{JobId, QueryId};
 use super::knowledge::{Knowledge, Pair, pair_of};
-use super::promise::{Guess, Promise};
+use super::overlap_model::{OverlapModel, Prediction};
 use super::recent::Recent;
 use super::second_look::SECOND_LOOKS_MAX;
 use super::shortlist::{Candidate, Shortlist};
@@ -62,7 +62,7 @@ pub const FETCH_BACKOFF_MAX: Duration = Duration::from_secs(30);
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Purpose {
     /// To state it, if there is any.
-    Propose(Guess),
+    Propose(Prediction),
     /// To answer somebody's alignment.
     Verify(EntryId),
 }
@@ -111,7 +111,7 @@ pub struct Negotiation {
     tried: BTreeSet<Pair>,
     tries: BTreeMap<(SubmapId, FrameId), usize>,
     /// What candidates promise.
-    pub promise: Promise,
+    pub overlap_model: OverlapModel,
     /// Foreign alignments to answer.
     pub verify: BTreeSet<EntryId>,
     /// Blobs on their way.
@@ -125,7 +125,7 @@ pub struct Negotiation {
     /// Something changed that may make work startable.
     stirred: bool,
     /// Pairs we are not responsible for and would like to see tried.
-    pub wishes: Shortlist,
+    pub peer_requests: Shortlist,
     /// Pairs that were refused and may be looked at again.
     second_looks: Shortlist,
 }
@@ -139,14 +139,14 @@ impl Negotiation {
             candidates: Shortlist::default(),
             tried: BTreeSet::new(),
             tries: BTreeMap::new(),
-            promise: Promise::new(sensor),
+            overlap_model: OverlapModel::new(sensor),
             verify: BTreeSet::new(),
             fetches: BTreeMap::new(),
             out_of_reach: BTreeSet::new(),
             running: BTreeMap::new(),
             begun: BTreeSet::new(),
             stirred: false,
-            wishes: Shortlist::default(),
+            peer_requests: Shortlist::default(),
             second_looks: Shortlist::default(),
         }
     }
@@ -164,7 +164,7 @@ impl Negotiation {
     }
 
     /// Something changed: look for work again.
-    pub fn stir(&mut self) {
+    pub fn mark_dirty(&mut self) {
         self.stirred = true;
     }
 
@@ -190,7 +190,7 @@ impl Negotiation {
     /// Candidates and wishes that name a submap which is gone go as well.
     pub fn drop_unknown(&mut self, knowledge: &Knowledge) {
         let known = |candidate: &Candidate| knowledge.submap(candidate.theirs).is_some();
-        for list in [&mut self.candidates, &mut self.wishes, &mut self.second_looks] {
+        for list in [&mut self.candidates, &mut self.peer_requests, &mut self.second_looks] {
             list.retain(known);
         }
     }
@@ -251,7 +251,7 @@ impl Negotiation {
 
     /// Neither among candidates nor among wishes would a pair less similar than this be kept.
     pub fn least_similarity(&self, limit: usize) -> f64 {
-        self.candidates.least(limit).min(self.wishes.least(limit))
+        self.candidates.least(limit).min(self.peer_requests.least(limit))
     }
 
     /// The other endpoint wishes this pair tried. False if it is unknown here.
@@ -310,7 +310,7 @@ impl Negotiation {
     /// Forgets all candidates (the set of facts was rebuilt). What was refused stays tried, and may be looked at again.
     pub fn clear_candidates(&mut self) {
         self.candidates.clear();
-        self.wishes.clear();
+        self.peer_requests.clear();
         self.begun.clear();
         self.verify.clear();
     }

@@ -5,7 +5,7 @@ use super::Agent;
 use super::allowance::FACT_BYTES;
 use super::knowledge::{Agreement, Pair, pair_of};
 use super::negotiation::{ALIGNMENTS_PER_SUBMAP, LOOPS_PER_SUBMAP, TRIES_PER_SUBMAP_FREE, TRIES_PER_SUBMAP_TIED};
-use super::promise::{Guess, Signs};
+use super::overlap_model::{OverlapFeatures, Prediction};
 use super::second_look;
 use super::shortlist::Candidate;
 use super::stated::Stated;
@@ -40,7 +40,7 @@ pub(super) struct Proposal {
     /// About what it makes both ends send.
     pub bytes: usize,
     /// How probable it is that it can be aligned.
-    pub guess: Guess,
+    pub prediction: Prediction,
     /// A second look, with further keypoints.
     pub further: bool,
 }
@@ -56,8 +56,8 @@ impl Agent {
             let lacking = self.blobs_lacking(&candidate, &stated);
             // Theirs is about as long as ours.
             let bytes = lacking * self.blob_of(mine, candidate.further).map_or(0, <[u8]>::len) + 2 * FACT_BYTES;
-            let guess = self.guess(&candidate);
-            Proposal { mine, theirs, may_wait: !joins && lacking > 0, bytes, guess, further: candidate.further }
+            let prediction = self.predict(&candidate);
+            Proposal { mine, theirs, may_wait: !joins && lacking > 0, bytes, prediction, further: candidate.further }
         };
         self.negotiation.ranked(|candidate| self.gain(candidate, &stated)).into_iter().map(proposal).collect()
     }
@@ -97,11 +97,11 @@ impl Agent {
         }
         // What bends a camera's submap is common to all its alignments: of LiDARs' alone many say more than a few.
         let averages = [pair.0, pair.1].into_iter().all(|id| self.knowledge.is_of_ranges(id));
-        let Guess { probability, signs } = self.guess(candidate);
+        let Prediction { probability, features } = self.predict(candidate);
         if candidate.further && !self.calls_for_second_look(candidate) {
             return None;
         }
-        let told = if averages { told(signs.apart) } else { 1.0 };
+        let told = if averages { told(features.apart) } else { 1.0 };
         let limit = if is_loop && averages { part(LOOPS_PER_SUBMAP, told) } else { ALIGNMENTS_PER_SUBMAP };
         if stated.most_of_either(pair) >= limit.max(self.config.estimate.alignments_min) {
             return None;
@@ -117,7 +117,7 @@ impl Agent {
         let Some((at_a, at_b)) = self.anchor(pair.0).zip(self.anchor(pair.1)) else {
             return (!is_tied).then_some(1.5 + worth / (1 + lacking) as f64);
         };
-        if signs.apart.is_some_and(|apart| apart > 1.0) || (probability < PROMISE_MIN && !candidate.further) {
+        if features.apart.is_some_and(|apart| apart > 1.0) || (probability < PROMISE_MIN && !candidate.further) {
             return None;
         }
         let news = stated.sigma(pair).map(|sigma| drift_between(at_a, at_b) / (sigma * at_b.sim().scale));
@@ -133,9 +133,9 @@ impl Agent {
         Some(0.5 * worth * share / (1 + lacking) as f64)
     }
 
-    fn guess(&self, candidate: &Candidate) -> Guess {
+    fn predict(&self, candidate: &Candidate) -> Prediction {
         let apart = self.apart(pair_of(candidate.mine, candidate.theirs));
-        self.negotiation.promise.guess(Signs { similarity: candidate.similarity, apart })
+        self.negotiation.overlap_model.predict(OverlapFeatures { similarity: candidate.similarity, apart })
     }
 
     /// How far two submaps are from one another by the joint estimate; see [`apart`].

@@ -10,7 +10,7 @@
 use super::Agent;
 use super::knowledge::pair_of;
 use super::negotiation::Work;
-use super::promise::Guess;
+use super::overlap_model::Prediction;
 use super::ranking::DRIFT_SIGMAS;
 use super::shortlist::Candidate;
 use super::two_sided;
@@ -34,13 +34,13 @@ pub(super) const WORTH: f64 = 0.1;
 
 impl Agent {
     /// A first look at a pair found too little. More keypoints may help, if there are any.
-    pub(super) fn note_second_look(&mut self, work: &Work, guess: Guess, reason: RefusalReason) {
+    pub(super) fn note_second_look(&mut self, work: &Work, prediction: Prediction, reason: RefusalReason) {
         let too_little = match reason {
             RefusalReason::TooFew | RefusalReason::NoConsensus | RefusalReason::PoorFit => true,
             RefusalReason::Ambiguous | RefusalReason::Degenerate | RefusalReason::BadInput => false,
         };
         if too_little && work.further.is_none() && self.address_of(work.theirs).is_some() {
-            let (mine, theirs, similarity) = (work.mine, work.theirs, guess.signs.similarity);
+            let (mine, theirs, similarity) = (work.mine, work.theirs, prediction.features.similarity);
             let candidate = Candidate { mine, theirs, similarity, wished: false, further: true };
             self.negotiation.add_second_look(candidate);
         }

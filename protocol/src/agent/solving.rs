@@ -3,7 +3,7 @@
 use super::Agent;
 use super::io::{Event, JobId};
 use super::job::{Job, SolveJob, Solved};
-use super::knowledge::{Gaps, Known, Question};
+use super::knowledge::{EstimationInput, Gaps, Known};
 use super::steps::Steps;
 use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{EntryId, FrameId, Hash, SubmapId};
@@ -53,7 +53,7 @@ impl Agent {
             let own = self.me.frame;
             let mut steps = core::mem::take(&mut self.map.steps).renewed();
             let odometry = |known: &Known| steps.of(known, || self.submap_fact(known).map(|fact| fact.odometry));
-            let Question { problem, alone, gaps } = self.knowledge.question(own, odometry);
+            let EstimationInput { problem, alone, gaps } = self.knowledge.question(own, odometry);
             self.map.steps = steps;
             let live = self.live_pairs(&problem, &gaps);
             let job = SolveJob { problem, config, own, live };
@@ -77,7 +77,7 @@ impl Agent {
         self.map.alone = core::mem::take(&mut self.map.posed_alone);
         self.map.solved = solved.with_indices(&core::mem::take(&mut self.map.posed_gaps));
         let merged = self.frames_merged_with_ours();
-        self.negotiation.stir();
+        self.negotiation.mark_dirty();
         let before = core::mem::replace(&mut self.map.merged, merged.clone());
         for frame in merged.difference(&before) {
             self.event(Event::Merged { frame: *frame });

@@ -1,6 +1,6 @@
 //! When to announce the root: Trickle timers (RFC 6206) for a quiet swarm, and an early turn for news.
 
-use super::purse::Purse;
+use super::token_bucket::TokenBucket;
 use crate::time::Instant;
 use core::time::Duration;
 use rand::{Rng, RngExt};
@@ -27,7 +27,7 @@ pub(super) struct Announce {
     agreeing: u32,
     news: usize,
     hearers: usize,
-    purse: Purse,
+    bucket: TokenBucket,
     said: Option<([u8; 8], Instant)>,
 }
 
@@ -42,7 +42,7 @@ impl Announce {
             agreeing: 0,
             news: 0,
             hearers: 0,
-            purse: Purse::new(NEWS_PER_SEC, NEWS_AT_ONCE, now),
+            bucket: TokenBucket::new(NEWS_PER_SEC, NEWS_AT_ONCE, now),
             said: None,
         }
     }
@@ -68,7 +68,7 @@ impl Announce {
         let said = self.said.is_some_and(|(said, at)| said == root && now.since(at) < REPEAT);
         if !said {
             self.news = self.news.max(1);
-            self.next = self.next.min(self.purse.due_soon(now, self.news as f64, self.copies()));
+            self.next = self.next.min(self.bucket.due_soon(now, self.news as f64, self.copies()));
         }
     }
 
@@ -77,7 +77,7 @@ impl Announce {
         if new > 0 {
             self.news = self.news.saturating_add(new);
             self.hearers = neighbours;
-            self.restart(self.purse.due_soon(now, self.news as f64, self.copies()));
+            self.restart(self.bucket.due_soon(now, self.news as f64, self.copies()));
         }
     }
 
@@ -90,10 +90,10 @@ impl Announce {
         let silent = known && self.agreeing >= ENOUGH;
         if !silent {
             self.said = Some((root, now));
-            self.purse.pay(now, self.news as f64, self.copies());
+            self.bucket.pay(now, self.news as f64, self.copies());
         }
         let again = now.after(self.pause.mul_f64(rng.random_range(0.75..1.25)));
-        self.next = again.max(self.purse.due_soon(now, 1.0, self.copies()));
+        self.next = again.max(self.bucket.due_soon(now, 1.0, self.copies()));
         self.pause = (2 * self.pause).min(self.pause_max);
         (self.agreeing, self.news) = (0, 0);
         !silent
@@ -104,9 +104,9 @@ impl Announce {
         (self.hearers as f64 / FEW).max(1.0)
     }
 
-    /// See [`Purse::refill`].
+    /// See [`TokenBucket::refill`].
     pub fn refill(&mut self, now: Instant) {
-        self.purse.refill(now);
+        self.bucket.refill(now);
     }
 
     fn restart(&mut self, at: Instant) {

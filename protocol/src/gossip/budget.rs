@@ -7,7 +7,7 @@
 //! ([`burst_bytes`]), but for the few bytes of "not now" to whoever asks beyond that; single announcements, questions
 //! and new facts may overdraw it and are paid back before anything follows them.
 
-use super::purse::Bucket;
+use super::token_bucket::Bucket;
 use crate::time::Instant;
 
 /// Shortest burst: the largest reserve and then a sync answer of useful size ([`REPAIR_BYTES_MIN`]) must fit.

@@ -20,25 +20,25 @@ mod announce;
 mod budget;
 mod experience;
 mod neighbour;
-mod purse;
 #[cfg(test)]
 mod tests;
+mod token_bucket;
 
 use crate::ids::{FrameId, RobotId};
 use crate::replica::{Have, Replica};
 use crate::time::Instant;
 use crate::wire::{HaveRoot, HaveVector};
 pub use budget::{Budget, Class, PIECE_BYTES_MIN, REPAIR_BYTES_MIN, burst_bytes};
-pub(crate) use purse::Bucket;
+pub(crate) use token_bucket::Bucket;
 
 use announce::Announce;
 use core::time::Duration;
 use experience::Experience;
 use neighbour::{Neighbour, Stake};
-use purse::Purse;
 use rand::Rng;
 use rand::RngExt;
 use std::collections::BTreeMap;
+use token_bucket::TokenBucket;
 
 /// Questions a second, as long as each brings little...
 const QUESTIONS_PER_SEC: f64 = 0.8;
@@ -52,7 +52,7 @@ const FAR_APART: usize = 48;
 pub enum Step {
     /// Broadcast this.
     Announce(HaveRoot),
-    /// Ask this neighbour what we lack; report with [`Spread::on_answer`], and when this was.
+    /// Ask this neighbour what we lack; report with [`AntiEntropy::on_answer`], and when this was.
     Ask {
         /// Whom.
         peer: RobotId,
@@ -81,24 +81,24 @@ pub enum Answer {
 
 /// The state of one robot's gossip about facts.
 #[derive(Clone, Debug)]
-pub struct Spread {
+pub struct AntiEntropy {
     me: RobotId,
     neighbours: BTreeMap<RobotId, Neighbour>,
     announce: Announce,
-    purse: Purse,
+    bucket: TokenBucket,
     experience: Experience,
     answer_max: Duration,
     wake: Instant,
 }
 
-impl Spread {
+impl AntiEntropy {
     /// Nobody is known. Announcements rest for `have_secs` at most, questions wait `answer_secs` at most.
     pub fn new(me: RobotId, have_secs: f64, answer_secs: f64, now: Instant) -> Self {
         Self {
             me,
             neighbours: BTreeMap::new(),
             announce: Announce::new(have_secs, now),
-            purse: Purse::new(QUESTIONS_PER_SEC, QUESTIONS_AT_ONCE, now),
+            bucket: TokenBucket::new(QUESTIONS_PER_SEC, QUESTIONS_AT_ONCE, now),
             experience: Experience::new(),
             answer_max: Duration::from_secs_f64(answer_secs),
             wake: now,
@@ -115,7 +115,7 @@ impl Spread {
         self.neighbours.contains_key(&robot)
     }
 
-    /// When [`Spread::step`] wants to be called at the latest. Only `step` and the events below change it.
+    /// When [`AntiEntropy::step`] wants to be called at the latest. Only `step` and the events below change it.
     pub fn timeout(&self) -> Instant {
         self.wake
     }
@@ -167,7 +167,7 @@ impl Spread {
             self.experience.answered(new > 0);
         }
         if matches!(answer, Answer::Got { new, .. } if new >= FAR_APART) {
-            self.purse.refill(now);
+            self.bucket.refill(now);
             self.announce.refill(now);
         }
     }
@@ -208,10 +208,10 @@ impl Spread {
         let mut best: Vec<(RobotId, f64)> = Vec::new();
         for (robot, neighbour) in &mut self.neighbours {
             if let Some(Stake { gain, copies }) = neighbour.lost() {
-                self.purse.give_back(now, gain, copies);
+                self.bucket.give_back(now, gain, copies);
             }
             match neighbour.promises(now, replica, (root, count), self.me < *robot, strangers) {
-                Ok(gain) => best.push((*robot, neighbour.hope() * gain)),
+                Ok(gain) => best.push((*robot, neighbour.retry_discount() * gain)),
                 Err(again) => self.wake = self.wake.min(again),
             }
         }
@@ -220,7 +220,7 @@ impl Spread {
             return None;
         }
         let copies = self.experience.copies(now, most);
-        let due = self.purse.due(now, most, copies);
+        let due = self.bucket.due(now, most, copies);
         if now < due {
             self.wake = self.wake.min(due);
             return None;
@@ -228,7 +228,7 @@ impl Spread {
         best.retain(|(_, gain)| 2.0 * gain >= most);
         let (peer, _) = best[rng.random_range(0..best.len())];
         let neighbour = self.neighbours.get_mut(&peer)?;
-        self.purse.pay(now, most, copies);
+        self.bucket.pay(now, most, copies);
         self.wake = now;
         let have = neighbour.question(now, self.me, replica, Stake { gain: most, copies });
         Some(Step::Ask { peer, have })

@@ -141,7 +141,7 @@ impl Neighbour {
 
     /// Share of what it promises that may be counted on. Called when no question keeps others back: one that is under way
     /// is overdue.
-    pub fn hope(&self) -> f64 {
+    pub fn retry_discount(&self) -> f64 {
         if self.asked.is_some() { HOPE } else { 1.0 }
     }
 
@@ -332,7 +332,10 @@ mod tests {
             let ends = one.patience_ends(now, longest).unwrap();
             assert_eq!(one.patience_ends(ends, longest), None);
             assert!(one.lost().is_some() && one.lost().is_none(), "given back once");
-            assert!(one.promises(ends, &replica, ours, true, 1).is_ok() && one.hope() < 0.5, "others come first");
+            assert!(
+                one.promises(ends, &replica, ours, true, 1).is_ok() && one.retry_discount() < 0.5,
+                "others come first"
+            );
             pauses.push(ends.since(now));
             now = ends;
         }

@@ -23,7 +23,7 @@ enum Event {
 struct Node {
     robot: RobotId,
     replica: Replica,
-    spread: Spread,
+    spread: AntiEntropy,
 }
 
 struct Swarm {
@@ -52,7 +52,7 @@ impl Swarm {
             let roster = (0..members(k)).map(|m| (name(m), key(m).verifying_key().to_bytes()));
             let replica = Replica::new(&samples::swarm(), roster, &GossipConfig::default()).unwrap();
             let robot = samples::robot(k);
-            Node { robot, replica, spread: Spread::new(robot, 16.0, TIMEOUT, Instant::ZERO) }
+            Node { robot, replica, spread: AntiEntropy::new(robot, 16.0, TIMEOUT, Instant::ZERO) }
         };
         let all = 0..usize::from(n);
         let linked = |a: usize| all.clone().filter(|b| a != *b && links(a.min(*b), a.max(*b))).collect();

@@ -42,7 +42,7 @@ pub enum AppendError {
 }
 
 impl Replica {
-    /// Signs a fact as the next entry of this robot's log of `frame_epoch`. It is held at once, but shown to nobody
+    /// OverlapFeatures a fact as the next entry of this robot's log of `frame_epoch`. It is held at once, but shown to nobody
     /// until [`Replica::mark_durable`].
     ///
     /// # Errors
@@ -54,7 +54,7 @@ impl Replica {
         Ok(entry)
     }
 
-    /// Signs these facts as the next entries of this robot's log of `frame_epoch`; the first states its own place as the
+    /// OverlapFeatures these facts as the next entries of this robot's log of `frame_epoch`; the first states its own place as the
     /// floor, and once it is durable everything below it is gone, here and on every robot that hears of it.
     ///
     /// # Errors

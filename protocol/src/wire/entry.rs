@@ -133,7 +133,7 @@ pub struct EntryContent {
 }
 
 impl Entry {
-    /// Signs an entry.
+    /// OverlapFeatures an entry.
     ///
     /// # Errors
     /// [`EntryError`] if the content is over a limit or contradicts itself.

@@ -169,8 +169,7 @@ fn repeats_are_ambiguous(aisles: &[(bool, f64)], halls: &[u64]) {
                 match register(&theirs.described.keypoints.first(SMALL), features, &config) {
                     Ok(_) => one += 1,
                     Err(
-                        RegisterError::Ambiguous { elsewhere: far, .. }
-                        | RegisterError::Lookalike { elsewhere: far, .. },
+                        RegisterError::Ambiguous { elsewhere: far, .. } | RegisterError::Aliased { elsewhere: far, .. },
                     ) => {
                         several += 1;
                         elsewhere += usize::from(far);

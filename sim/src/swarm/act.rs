@@ -1,7 +1,7 @@
 //! The shell's part of a robot: events become inputs, outputs become events.
 
+use super::alignment_oracle;
 use super::robot::{Asked, job_nanos};
-use super::standin;
 use super::store::Committed;
 use super::{Event, OUTPUTS_MAX, Swarm, TOLD_MAX, Told, hostile};
 use crate::check::Seen;
@@ -148,7 +148,7 @@ impl<C: Core> Swarm<C> {
     /// Does heavy work, or what stands for it.
     fn work(&mut self, robot: usize, job: Job) -> JobResult {
         let drive = self.drives(robot);
-        let Some(stand_in) = &mut self.standin else {
+        let Some(stand_in) = &mut self.oracle else {
             return self.stopwatch.time(job.kind(), || job.run());
         };
         let (one, steps) = (&self.robots[robot], self.stage.steps(drive));
@@ -163,7 +163,7 @@ impl<C: Core> Swarm<C> {
                 let step = own.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))?;
                 Some(step.t_world_body * t_anchor_body.inverse())
             };
-            standin::middle(&submap.keyframes.iter().filter_map(by_keyframe).collect::<Vec<_>>())
+            alignment_oracle::middle(&submap.keyframes.iter().filter_map(by_keyframe).collect::<Vec<_>>())
         };
         let kind = job.kind();
         let (result, lied) = self.stopwatch.time(kind, || stand_in.run(one.name.as_str(), job, locate));

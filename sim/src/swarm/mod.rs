@@ -3,13 +3,13 @@
 //! Robots' process clocks begin when their processes do, so an instant kept across a restart shows as a fault.
 
 mod act;
+mod alignment_oracle;
 #[cfg(test)]
 pub(crate) mod fake;
 mod fate;
 mod hostile;
 mod look;
 mod robot;
-mod standin;
 mod stopwatch;
 mod store;
 mod trace;
@@ -26,6 +26,7 @@ use crate::network::{Network, millis};
 use crate::queue::Queue;
 use crate::scenario::Scenario;
 use crate::stage::{Stage, StageError};
+use alignment_oracle::AlignmentOracle;
 use merganser_protocol::agent::StartError;
 use merganser_protocol::agent::io::{Channel, Event as Told, JobId, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
@@ -33,7 +34,6 @@ use merganser_protocol::geometry::Sim3;
 use merganser_protocol::ids::{NameError, RobotId};
 use merganser_protocol::time::Instant;
 use robot::{Robot, Slam, identities};
-use standin::StandIn;
 use std::collections::BTreeMap;
 use thiserror::Error;
 use trace::Trace;
@@ -71,7 +71,7 @@ pub struct Swarm<C> {
     robots: Vec<Robot<C>>,
     ids: BTreeMap<RobotId, usize>,
     checks: Checks,
-    standin: Option<StandIn>,
+    oracle: Option<AlignmentOracle>,
     trace: Trace,
     counts: FaultCounts,
     truth: BTreeMap<String, Sim3>,
@@ -187,7 +187,7 @@ impl<C: Core> Swarm<C> {
             field,
             network: Network::new(scenario.network.clone(), robots.len(), seed),
             ids: robots.iter().take(members).enumerate().map(|(index, robot)| (robot.id, index)).collect(),
-            standin: scenario.summary.clone().map(|options| StandIn::new(options, seed)),
+            oracle: scenario.summary.clone().map(|options| AlignmentOracle::new(options, seed)),
             scenario,
             stage,
             seed,

@@ -7,8 +7,8 @@
 use super::clique::{self, Set, bit};
 use super::measured::{Alignment, Measured};
 use super::scaled::{Scale, Scaled};
+use crate::relative_odometry::{OdometryStep, RelativeOdometry};
 use crate::residual::Residual;
-use crate::ways::{Way, Ways};
 use core::f64::consts::PI;
 use libm::{lgamma, log};
 use nalgebra::SMatrix;
@@ -35,8 +35,8 @@ impl Pairs {
             scales: vec![Scale { value: 1.0, log_sigma: f64::INFINITY }; n * n],
         };
         let (alpha, beta) = (
-            Ways::new(measured.alpha, alignments.iter().map(|a| a.i)),
-            Ways::new(measured.beta, alignments.iter().map(|a| a.j)),
+            RelativeOdometry::new(measured.alpha, alignments.iter().map(|a| a.i)),
+            RelativeOdometry::new(measured.beta, alignments.iter().map(|a| a.j)),
         );
         for (m, hypothesis) in alignments.iter().enumerate() {
             let (from_i, from_j) = (alpha.from(alpha.slot(hypothesis.i)), beta.from(beta.slot(hypothesis.j)));
@@ -105,8 +105,8 @@ impl Pairs {
 fn distance<const N: usize, G: Scaled<N>>(
     hypothesis: &Alignment<N, G>,
     tested: &Alignment<N, G>,
-    (a, sigma_a): &Way,
-    (b, sigma_b): &Way,
+    (a, sigma_a): &OdometryStep,
+    (b, sigma_b): &OdometryStep,
     scale: f64,
 ) -> (f64, f64) {
     let ((tested, of_tested), (hypothesis, of_hypothesis)) = (tested.at(scale), hypothesis.at(scale));

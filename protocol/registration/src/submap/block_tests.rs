@@ -1,4 +1,4 @@
-use super::super::landmarks::{Chart, Constellation};
+use super::super::landmarks::{Codec, Constellation};
 use super::super::testing::room;
 use super::super::{Features, Keypoints};
 use super::*;
@@ -48,7 +48,7 @@ fn a_blob_names_the_one_that_goes_on_with_it() {
     // What is not of the same cloud is not added.
     let coarser = Block::new(0.2, 1.0);
     assert_eq!(first.with_further(&Keypoints::of_points(coarser)), None);
-    let landmarks = Chart::new(0.1, &Constellation::default());
+    let landmarks = Codec::new(0.1, &Constellation::default());
     assert_eq!(first.with_further(&Keypoints::of_landmarks(landmarks)), None);
 }
 

@@ -10,7 +10,7 @@
 
 use super::continuity::{Continuity, FrameSign};
 use super::gravity::{self, Up};
-use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened, settle};
+use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, adjust, flattened};
 use super::misfit::{Misfits, Views};
 use super::modality::Modality;
 use super::odometry::{across_gap_after, isotropic, motion};
@@ -417,7 +417,7 @@ impl Open {
         let anchor = self.middle();
         let keyframes: Vec<Se3> = self.keyframes.iter().map(|t_first_body| t_anchor_first * *t_first_body).collect();
         let up = gravity::mean(&self.ups, &keyframes, &self.motions, anchor);
-        let constellation = settle(&self.landmarks.finish(), &self.motions, &keyframes, anchor);
+        let constellation = adjust(&self.landmarks.finish(), &self.motions, &keyframes, anchor);
         let (mut cloud, seen_from) = self.cloud.finish();
         let about_anchor = |p: [f32; 3]| moved(&t_anchor_first, p.map(f64::from)).map(|x| x as f32);
         cloud.iter_mut().for_each(|p| *p = about_anchor(*p));

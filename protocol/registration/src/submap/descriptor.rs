@@ -4,7 +4,7 @@
 //! bytes; one's own points keep 8. Measured on real submaps: of the right matches that 60 exact numbers find, 4 % are
 //! lost by the map and 8 % by the rounding.
 
-use super::rings::{self, NUMBERS};
+use super::local_descriptor::{self, NUMBERS};
 
 /// Numbers in a descriptor.
 pub const DIMENSIONS: usize = 32;
@@ -49,7 +49,7 @@ impl Projection {
         }
     }
 
-    fn numbers(&self, of: &rings::Numbers) -> [f32; DIMENSIONS] {
+    fn numbers(&self, of: &local_descriptor::Numbers) -> [f32; DIMENSIONS] {
         let mut sums = [0.0; DIMENSIONS];
         for ((weights, number), mean) in self.weights.iter().zip(of).zip(&self.means) {
             for (sum, weight) in sums.iter_mut().zip(weights) {
@@ -60,12 +60,12 @@ impl Projection {
     }
 
     /// The descriptor to compare with.
-    pub fn code(&self, of: &rings::Numbers) -> Code {
+    pub fn code(&self, of: &local_descriptor::Numbers) -> Code {
         self.numbers(of).map(|x| (x * STEPS).round().clamp(-127.0, 127.0) as i8)
     }
 
     /// The descriptor to send.
-    pub fn pack(&self, of: &rings::Numbers) -> Packed {
+    pub fn pack(&self, of: &local_descriptor::Numbers) -> Packed {
         let numbers = self.numbers(of);
         let mut packed = [0; PACKED_LEN];
         for (k, (number, sigma)) in numbers.iter().zip(self.sigmas).enumerate() {
@@ -127,7 +127,7 @@ mod tests {
             numbers in prop::collection::vec(-1.0..1.0f32, NUMBERS),
         ) {
             let projection = Projection::new();
-            let numbers: rings::Numbers = numbers.try_into().unwrap();
+            let numbers: local_descriptor::Numbers = numbers.try_into().unwrap();
             let (exact, sent) = (projection.numbers(&numbers), projection.unpack(&projection.pack(&numbers)));
             for k in 0..DIMENSIONS {
                 let half = SPAN_SIGMAS * projection.sigmas[k];

@@ -10,8 +10,8 @@
 
 use super::block::{BARE_LEN, Block, BlockError, HEADER_LEN, Surfel};
 use super::descriptor::{Code, PACKED_LEN, Projection};
-use super::landmarks::{Chart, LANDMARKS_MAX};
-use super::rings;
+use super::landmarks::{Codec, LANDMARKS_MAX};
+use super::local_descriptor;
 use crate::ids::Hash;
 use nalgebra::Vector3;
 use std::sync::OnceLock;
@@ -45,7 +45,7 @@ pub const KEYPOINT_LEN: usize = Block::<PACKED_LEN>::POINT_LEN;
 pub struct Keypoints {
     pub(super) block: Block<PACKED_LEN>,
     /// In the place of points, if these are landmarks.
-    pub(super) landmarks: Option<Chart>,
+    pub(super) landmarks: Option<Codec>,
     /// Address of the blob that holds further ones.
     further: Option<Hash>,
 }
@@ -61,7 +61,7 @@ pub struct Features {
     /// Descriptors, once asked for.
     pub(super) codes: Codes,
     /// In the place of points, if these are landmarks.
-    pub(super) landmarks: Option<Chart>,
+    pub(super) landmarks: Option<Codec>,
 }
 
 /// A function of the points, computed once.
@@ -82,7 +82,7 @@ impl Keypoints {
     }
 
     /// Landmarks.
-    pub(super) fn of_landmarks(chart: Chart) -> Self {
+    pub(super) fn of_landmarks(chart: Codec) -> Self {
         Self { block: Block::new(chart.voxel(), 0.0), landmarks: Some(chart), further: None }
     }
 
@@ -139,7 +139,7 @@ impl Keypoints {
 
     fn decode_alone(bytes: &[u8]) -> Result<Self, BlockError> {
         if bytes.starts_with(&LANDMARK_KEYPOINTS_MAGIC) {
-            return Chart::decode(bytes, LANDMARK_KEYPOINTS_MAGIC, LANDMARKS_MAX).map(Self::of_landmarks);
+            return Codec::decode(bytes, LANDMARK_KEYPOINTS_MAGIC, LANDMARKS_MAX).map(Self::of_landmarks);
         }
         Block::decode(bytes, KEYPOINTS_MAGIC, KEYPOINTS_MAX).map(Self::of_points)
     }
@@ -161,7 +161,7 @@ impl Keypoints {
 
 impl Features {
     /// Landmarks, and from where they were seen.
-    pub(super) fn of_landmarks(chart: Chart, viewpoints: Vec<[f32; 3]>) -> Self {
+    pub(super) fn of_landmarks(chart: Codec, viewpoints: Vec<[f32; 3]>) -> Self {
         let block = Block::new(chart.voxel(), 0.0);
         let codes = Codes::default();
         Self { block, viewpoints, seen_from: Vec::new(), codes, landmarks: Some(chart) }
@@ -183,7 +183,10 @@ impl Features {
             let (points, normals) = in_voxels(&self.block);
             let all: Vec<u32> = (0..).take(points.len()).collect();
             let projection = Projection::new();
-            rings::describe_points(&points, &normals, &all).iter().map(|numbers| projection.code(numbers)).collect()
+            local_descriptor::describe_points(&points, &normals, &all)
+                .iter()
+                .map(|numbers| projection.code(numbers))
+                .collect()
         })
     }
 
@@ -220,7 +223,7 @@ impl Features {
             return Err(BlockError::BadScale);
         }
         if rest.starts_with(&LANDMARK_FEATURES_MAGIC) {
-            let chart = Chart::decode(rest, LANDMARK_FEATURES_MAGIC, LANDMARKS_MAX)?;
+            let chart = Codec::decode(rest, LANDMARK_FEATURES_MAGIC, LANDMARKS_MAX)?;
             return Ok(Self::of_landmarks(chart, viewpoints));
         }
         // What remains is the block and one byte for each of its points.
@@ -258,7 +261,7 @@ macro_rules! described_points {
         impl $kind {
             /// Number of points.
             pub fn len(&self) -> usize {
-                self.landmarks.as_ref().map_or(self.block.points.len(), Chart::len)
+                self.landmarks.as_ref().map_or(self.block.points.len(), Codec::len)
             }
 
             /// Whether there are none.
@@ -268,7 +271,7 @@ macro_rules! described_points {
 
             /// Edge of the voxel that the cloud was thinned to, frame units.
             pub fn voxel(&self) -> f64 {
-                self.landmarks.as_ref().map_or(self.block.voxel(), Chart::voxel)
+                self.landmarks.as_ref().map_or(self.block.voxel(), Codec::voxel)
             }
 
             /// The points as pieces of surface; none if these are landmarks.

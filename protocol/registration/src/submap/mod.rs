@@ -10,11 +10,11 @@
 //! Lengths are in frame units (metres, unless the frame's scale is unknown). Everything here is a pure function of its
 //! arguments, equal to the bit on every machine.
 
+mod aliasing;
 mod block;
 pub mod builder;
 mod cloud;
 pub mod continuity;
-mod court;
 pub mod describe;
 mod descriptor;
 pub mod features;
@@ -22,7 +22,7 @@ pub mod gravity;
 mod grid;
 mod hypotheses;
 pub mod landmarks;
-mod lookalike;
+mod local_descriptor;
 mod matching;
 mod misfit;
 mod modality;
@@ -33,16 +33,16 @@ pub mod planar;
 pub mod refine;
 mod refusal;
 pub mod register;
-mod rings;
 pub mod runs;
 mod sampling;
 mod scene;
-mod shifts;
 pub mod summary;
 mod surface;
 #[doc(hidden)]
 pub mod testing;
 mod thinning;
+mod translation_voting;
+mod verifier;
 mod views;
 mod visibility;
 

@@ -3,7 +3,7 @@
 //! Where submaps overlap by a third, three to ten of their keypoints have a right match among a thousand wrong ones: no
 //! count of matches tells that from chance (MATH §4). But a pose can be *looked at*: of their points, so many would lie
 //! on my surface and none where I saw air. So the consensus' pose, if there is one, joins the poses that few matches
-//! suggest (`hypotheses`); the most promising are judged by all keypoints (`court`).
+//! suggest (`hypotheses`); the most promising are judged by all keypoints (`verifier`).
 //!
 //! **Score.** A confirmed point weighs ln(q/f): q is its chance under a right pose and f how often it is confirmed under
 //! the *other* poses of this very pair, so that ground on ground, which fits anywhere, weighs nothing. A contradicted
@@ -13,15 +13,15 @@
 //! same score that would itself pass, nor one elsewhere that nothing contradicts (`lookalike`), else the answer is
 //! *ambiguous*.
 
-use super::court::{Court, Judged};
+use super::aliasing;
 use super::features::{Features, Keypoints, in_voxels};
 use super::gravity::{Upright, Verticals};
 use super::hypotheses::{POSES_MAX, hypotheses};
-use super::lookalike;
 use super::matching::pair_up;
 use super::refine::{RefineConfig, RefineError, Refined, refine_anchored};
 use super::scene::{Cloud, Pose, Scene};
 use super::summary::VOXEL_RATIO_MAX;
+use super::verifier::{Judged, PoseVerifier};
 use crate::align::{AlignError, Problem, SolverConfig, align};
 use crate::geometry::{Se3, So3};
 use nalgebra::Vector3;
@@ -132,7 +132,7 @@ pub enum RegisterError {
         "{support} matches support one pose, {rival} another, far from it, that nothing contradicts: the place looks like \
          another"
     )]
-    Lookalike {
+    Aliased {
         /// Matches that agree with the best pose.
         support: usize,
         /// Of those with what lies elsewhere, those that agree with the other.
@@ -191,10 +191,10 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     // The others still tell what chance does.
     let upright = Upright(config.verticals);
     let scene = Scene::new(mine);
-    let court = Court::new(&their_cloud, &my_cloud, &pairings.all, &scene, &poses);
+    let verifier = PoseVerifier::new(&their_cloud, &my_cloud, &pairings.all, &scene, &poses);
     poses.retain(|pose| upright.allows_rough(pose));
     let count = poses.len();
-    let mut judged = court.judge(&poses);
+    let mut judged = verifier.judge(&poses);
     judged.retain(|j| upright.allows(&j.pose));
     let passes = |j: &&Judged| {
         j.score >= config.score_min && j.fit >= config.fit_min && j.contradiction() <= config.contradiction_max
@@ -206,16 +206,16 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     };
     // A rival need not pass itself: it is enough that it is credible.
     let credible = |j: &&Judged| j.fit >= config.fit_min && j.contradiction() <= 2.0 * config.contradiction_max;
-    let rival = judged.iter().filter(credible).find(|j| court.rivals(&best.pose, &j.pose));
-    let is_elsewhere = |rival: &Judged| court.differ(&rival.pose, &best.pose, ELSEWHERE, f64::INFINITY);
+    let rival = judged.iter().filter(credible).find(|j| verifier.rivals(&best.pose, &j.pose));
+    let is_elsewhere = |rival: &Judged| verifier.differ(&rival.pose, &best.pose, ELSEWHERE, f64::INFINITY);
     if let Some(rival) = rival.filter(|rival| rival.score >= config.rival_ratio * best.score) {
         let elsewhere = is_elsewhere(rival);
         return Err(RegisterError::Ambiguous { score: best.score, rival: rival.score, elsewhere });
     }
     let clouds = (&their_cloud, &my_cloud);
-    if let Some(rival) = lookalike::rival(&pairings, (mine, &my_points), clouds, &court, best, &upright) {
+    if let Some(rival) = aliasing::rival(&pairings, (mine, &my_points), clouds, &verifier, best, &upright) {
         let elsewhere = is_elsewhere(&rival);
-        return Err(RegisterError::Lookalike { support: best.support.len(), rival: rival.support.len(), elsewhere });
+        return Err(RegisterError::Aliased { support: best.support.len(), rival: rival.support.len(), elsewhere });
     }
     let anchors = best
         .support
@@ -234,7 +234,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &RegisterConfig) ->
     }
     // Along a corridor all poses are nearly as good, and the matches that seem to hold this one were chosen to.
     if refined.share < config.refine.share_min {
-        let slid = court.slid(best);
+        let slid = verifier.slid(best);
         if slid > config.slid_max * best.surface {
             return Err(RegisterError::Ambiguous { score: best.surface, rival: slid, elsewhere: false });
         }

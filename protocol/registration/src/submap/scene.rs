@@ -96,7 +96,7 @@ impl Scene {
     }
 
     /// A first look at a point of theirs.
-    pub fn glance(&self, at: &Vector3<f64>, normal: &Vector3<f64>) -> Verdict {
+    pub fn coarse_score(&self, at: &Vector3<f64>, normal: &Vector3<f64>) -> Verdict {
         if self.confirms(at, normal) {
             Verdict::Confirmed
         } else if self.views.looked_through(at) {

@@ -1,7 +1,7 @@
 //! The gossip under test, behind one door.
 
 use super::plain::Plain;
-use merganser_protocol::gossip::{Answer, Spread, Step};
+use merganser_protocol::gossip::{Answer, AntiEntropy, Step};
 use merganser_protocol::ids::RobotId;
 use merganser_protocol::replica::{Have, Replica};
 use merganser_protocol::time::Instant;
@@ -19,7 +19,7 @@ pub enum Policy {
 
 /// One robot's gossip.
 pub enum Gossip {
-    Ours(Spread),
+    Ours(AntiEntropy),
     Plain(Plain),
 }
 
@@ -27,7 +27,7 @@ impl Gossip {
     pub fn new(policy: Policy, me: RobotId, now: Instant) -> Self {
         let config = merganser_protocol::config::GossipConfig::default();
         match policy {
-            Policy::Ours => Self::Ours(Spread::new(me, config.have_secs, config.answer_secs, now)),
+            Policy::Ours => Self::Ours(AntiEntropy::new(me, config.have_secs, config.answer_secs, now)),
             Policy::Plain => Self::Plain(Plain::new(me)),
         }
     }

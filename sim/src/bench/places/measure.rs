@@ -5,7 +5,7 @@ use crate::bench::cpu::thread_seconds;
 use merganser_protocol::align::SolverConfig;
 use merganser_protocol::config::Sensor;
 use merganser_protocol::geometry::Se3;
-use merganser_protocol::submap::planar::{self, FlatConfig};
+use merganser_protocol::submap::planar::{self, PlanarConfig};
 use merganser_protocol::submap::{
     Features, RefineConfig, RegisterConfig, RegisterError, Registered, Verticals, register,
 };
@@ -85,7 +85,7 @@ fn one(sets: &[Set], their: At, mine: At) -> anyhow::Result<Tried> {
     let start = thread_seconds();
     let keypoints = &theirs.described.keypoints;
     let answer = if sensor == Sensor::Laser2d {
-        planar::register(keypoints, &features, &FlatConfig::default())
+        planar::register(keypoints, &features, &PlanarConfig::default())
     } else {
         register(keypoints, &features, &config)
     };

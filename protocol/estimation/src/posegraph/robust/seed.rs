@@ -3,10 +3,10 @@
 
 use super::Closure;
 use super::backbone::Backbone;
+use crate::admission::Admission;
 use crate::config::EstimateConfig;
 use crate::geometry::{PoseWithCovariance, Relative, Sim3};
 use crate::ids::{EntryId, SubmapId};
-use crate::intake::Intake;
 use crate::kinds::ScaleKind;
 use crate::marginals::certain;
 use crate::{AgreedAlignment, FrameChain, MapProblem, pairs};
@@ -39,10 +39,10 @@ impl Seed {
         };
         let tied = closures.iter().filter(|c| [c.i, c.j].iter().all(|id| frames.contains_key(&id.frame)));
         let alignments = tied.map(agreed).collect();
-        let mut intake = Intake::new(&MapProblem { frames, alignments, ..MapProblem::default() });
-        let pairs = pairs::consensus(&mut intake, config);
-        let start = pairs::start(&intake, &pairs);
-        let used = intake.edges.iter().filter(|e| e.is_used()).map(|e| e.measurement.entry.seq as usize).collect();
+        let mut admission = Admission::new(&MapProblem { frames, alignments, ..MapProblem::default() });
+        let pairs = pairs::consensus(&mut admission, config);
+        let start = pairs::start(&admission, &pairs);
+        let used = admission.edges.iter().filter(|e| e.is_used()).map(|e| e.measurement.entry.seq as usize).collect();
         Self { used, start }
     }
 }

@@ -5,7 +5,7 @@ use super::super::describe::Described;
 use super::super::features::{Features, KEYPOINT_LEN, KEYPOINTS_MAX, Keypoints, VIEWPOINTS_MAX};
 use super::super::summary::{Summary, WORDS};
 use super::super::thinning::hash_of;
-use super::{Chart, DESCRIPTOR_LEN, Descriptor, Landmark};
+use super::{Codec, DESCRIPTOR_LEN, Descriptor, Landmark};
 use crate::config::SubmapConfig;
 
 /// Words that a label counts for: two labels rarely share more than one.
@@ -20,8 +20,8 @@ const LEVELS: usize = WORDS / GROUPS;
 pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     let landmarks = &submap.constellation.landmarks;
     let extent = [0, 1, 2].map(|axis| landmarks.iter().fold(0.0, |most: f32, l| most.max(l.at[axis].abs() as f32)));
-    let chart = Chart::new(config.voxel_m, &submap.constellation);
-    let within = |chart: &Chart, keypoints: usize| chart.within(KEYPOINT_LEN * keypoints.min(KEYPOINTS_MAX));
+    let chart = Codec::new(config.voxel_m, &submap.constellation);
+    let within = |chart: &Codec, keypoints: usize| chart.within(KEYPOINT_LEN * keypoints.min(KEYPOINTS_MAX));
     let first = within(&chart, config.keypoints);
     let further = Some(within(&chart.after(first.len()), config.keypoints_further)).filter(|further| further.len() > 0);
     let further = further.map(Keypoints::of_landmarks);

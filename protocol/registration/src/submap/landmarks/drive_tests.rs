@@ -3,7 +3,7 @@
 use super::super::builder::{Submap, SubmapBuilder};
 use super::super::{CovarianceOf, Described, Keyframe, Keypoints, describe};
 use super::tests::{Dice, Thing, flat_frame, nees, normal, planar, vector, world};
-use super::{Chart, Mark, SIGMA_RANGE, register};
+use super::{Codec, Mark, SIGMA_RANGE, register};
 use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, So3};
 use crate::ids::Hash;
@@ -188,7 +188,7 @@ fn memory_is_bounded_and_a_blob_stays_within_its_bytes() {
         assert!((fewest..=7_000).contains(&len), "{len}");
     }
     let both = described.keypoints.with_further(&further).unwrap();
-    let landmarks = |of: &Chart| of.landmarks();
+    let landmarks = |of: &Codec| of.landmarks();
     let all = landmarks(described.features.landmarks.as_ref().unwrap());
     assert_eq!(landmarks(both.landmarks.as_ref().unwrap()), all[..both.len()]);
     assert_eq!(Keypoints::decode(&blob).unwrap().further(), Some(Hash::of(&further.encode())));

@@ -3,7 +3,7 @@
 //! wrong matches would agree by accident (MATH §4), where a label is wrong with probability [`LABEL_WRONG`] and a wrong
 //! match may lie anywhere in the submap.
 
-use super::super::planar::Flat;
+use super::super::planar::Se2;
 use super::LandmarkError;
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
@@ -48,7 +48,7 @@ pub struct Match {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Agreed {
     /// `t_mine_theirs`.
-    pub pose: Flat,
+    pub pose: Se2,
     /// Of its local perturbation (x, y, angle).
     pub covariance: Matrix3<f64>,
     /// Matches that agree, and how many of them by label.
@@ -61,7 +61,7 @@ pub struct Agreed {
 
 /// A fitted hypothesis.
 struct Fit {
-    pose: Flat,
+    pose: Se2,
     information: Matrix3<f64>,
     members: Vec<usize>,
     chi2: f64,
@@ -113,8 +113,8 @@ pub fn agree(matches: &[Match], area: f64, rival_ratio: f64, rotation_sigma_max:
 }
 
 /// The poses that two matches suggest and most others agree with, best first.
-fn hypotheses(matches: &[Match]) -> Vec<Flat> {
-    let mut found: Vec<(f64, Flat)> = Vec::new();
+fn hypotheses(matches: &[Match]) -> Vec<Se2> {
+    let mut found: Vec<(f64, Se2)> = Vec::new();
     for (k, a) in matches.iter().enumerate() {
         for b in &matches[..k] {
             let (theirs, mine) = (b.theirs.at - a.theirs.at, b.mine.at - a.mine.at);
@@ -125,21 +125,21 @@ fn hypotheses(matches: &[Match]) -> Vec<Flat> {
                 continue;
             }
             let angle = libm::atan2(mine.y, mine.x) - libm::atan2(theirs.y, theirs.x);
-            let turn = Flat::new(super::super::planar::wrapped(angle), Vector2::zeros());
+            let turn = Se2::new(super::super::planar::wrapped(angle), Vector2::zeros());
             let middle = (a.mine.at + b.mine.at) / 2.0;
-            let pose = Flat::new(turn.angle, middle - turn.turn(&((a.theirs.at + b.theirs.at) / 2.0)));
+            let pose = Se2::new(turn.angle, middle - turn.turn(&((a.theirs.at + b.theirs.at) / 2.0)));
             let cost: f64 = matches.iter().map(|m| distance(m, &pose).0.min(CHI2_ROUGH)).sum();
             found.push((cost, pose));
         }
     }
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
     // Hypotheses of one pose use up no more than their share.
-    let mut kept: Vec<Flat> = Vec::new();
+    let mut kept: Vec<Se2> = Vec::new();
     for (_, pose) in found {
         if kept.len() == FITTED_MAX {
             break;
         }
-        let same = |other: &Flat| {
+        let same = |other: &Se2| {
             matches
                 .iter()
                 .all(|m| (pose.apply(&m.theirs.at) - other.apply(&m.theirs.at)).norm_squared() < 1e-4 * variance_of(m))
@@ -156,7 +156,7 @@ fn variance_of(m: &Match) -> f64 {
 }
 
 /// Squared distance of a match under a pose, and its error and information.
-fn distance(m: &Match, pose: &Flat) -> (f64, Vector2<f64>, Matrix2<f64>) {
+fn distance(m: &Match, pose: &Se2) -> (f64, Vector2<f64>, Matrix2<f64>) {
     let error = pose.apply(&m.theirs.at) - m.mine.at;
     let turn = Matrix2::from_columns(&[pose.turn(&Vector2::x()), pose.turn(&Vector2::y())]);
     let covariance = m.mine.covariance + turn * m.theirs.covariance * turn.transpose();
@@ -165,7 +165,7 @@ fn distance(m: &Match, pose: &Flat) -> (f64, Vector2<f64>, Matrix2<f64>) {
 }
 
 /// Least squares over the matches near the pose, which are chosen anew after each step.
-fn fit(matches: &[Match], pose: &Flat) -> Option<Fit> {
+fn fit(matches: &[Match], pose: &Se2) -> Option<Fit> {
     let mut pose = *pose;
     let mut gate = CHI2_ROUGH;
     for round in 0..FITS {
@@ -198,7 +198,7 @@ fn fit(matches: &[Match], pose: &Flat) -> Option<Fit> {
 }
 
 /// Of a point's place about the pose's local perturbation.
-fn jacobian(p: &Vector2<f64>, pose: &Flat) -> nalgebra::Matrix2x3<f64> {
+fn jacobian(p: &Vector2<f64>, pose: &Se2) -> nalgebra::Matrix2x3<f64> {
     let columns = [Vector2::x(), Vector2::y(), Vector2::new(-p.y, p.x)];
     nalgebra::Matrix2x3::from_columns(&columns.map(|c| pose.turn(&c)))
 }

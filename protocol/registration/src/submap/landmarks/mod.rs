@@ -11,22 +11,22 @@
 //!
 //! Lengths are in frame units.
 
-mod chart;
+mod bundle_adjustment;
+mod codec;
 mod describe;
 #[cfg(test)]
 mod drive_tests;
 mod flat;
 mod gather;
 mod register;
-mod settle;
 #[cfg(test)]
 mod tests;
 
-pub(super) use chart::Chart;
+pub(super) use bundle_adjustment::adjust;
+pub(super) use codec::Codec;
 pub use describe::describe;
 pub(super) use gather::Gatherer;
 pub use register::{Aligned, LandmarkConfig, LandmarkError, register};
-pub(super) use settle::settle;
 
 use crate::geometry::Covariance;
 

@@ -1,7 +1,7 @@
 //! Landmark worlds with known truth: what is found, what is refused, and whether the stated covariances are honest.
 
 use super::super::{Features, Keypoints};
-use super::{Aligned, Chart, Constellation, Descriptor, Landmark, LandmarkConfig, LandmarkError, Mark, register};
+use super::{Aligned, Codec, Constellation, Descriptor, Landmark, LandmarkConfig, LandmarkError, Mark, register};
 use crate::align::{Model, SolverConfig};
 use crate::geometry::{Covariance, Relative, Sim3, So3};
 use crate::kinds::RefusalReason;
@@ -84,12 +84,12 @@ fn constellation(landmarks: &[Landmark]) -> Constellation {
 }
 
 fn offered(landmarks: &[Landmark], voxel: f64) -> Keypoints {
-    let keypoints = Keypoints::of_landmarks(Chart::new(voxel, &constellation(landmarks)));
+    let keypoints = Keypoints::of_landmarks(Codec::new(voxel, &constellation(landmarks)));
     Keypoints::decode(&keypoints.encode()).unwrap()
 }
 
 fn kept(landmarks: &[Landmark], voxel: f64) -> Features {
-    let features = Features::of_landmarks(Chart::new(voxel, &constellation(landmarks)), vec![[0.0; 3]]);
+    let features = Features::of_landmarks(Codec::new(voxel, &constellation(landmarks)), vec![[0.0; 3]]);
     Features::decode(&features.encode()).unwrap()
 }
 

@@ -8,7 +8,7 @@ use super::super::features::{Codes, FEATURES_MAX, Features, KEYPOINTS_MAX, Keypo
 use super::super::sampling::{rest, spread};
 use super::super::summary::{Summary, WORDS};
 use super::super::surface::Normal;
-use super::chart::{Beam, passed};
+use super::codec::{Beam, passed};
 use super::lines::{Line, lines};
 use crate::config::SubmapConfig;
 use nalgebra::{Vector2, Vector3};

@@ -2,8 +2,8 @@
 //! nearest point that faces the same way, with Cauchy weights at the noise scale that the residuals show.
 
 use super::super::near::{Near, Piece};
-use super::flat::Flat;
 use super::lines::piece;
+use super::se2::Se2;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 /// Least noise scale: a thinned wall is no sharper.
@@ -69,7 +69,7 @@ pub fn counterpart(near: &Near, at: &Vector2<f64>, normal: &Vector2<f64>, radius
 }
 
 /// The system of `walls` placed by `pose` before what `near` holds; pairs face alike with at least this cosine.
-pub fn system(walls: &Walls, near: &Near, pose: &Flat, radius: f64, cos_min: f64) -> System {
+pub fn system(walls: &Walls, near: &Near, pose: &Se2, radius: f64, cos_min: f64) -> System {
     let mut rows = Vec::with_capacity(walls.points.len());
     for (p, n) in walls.points.iter().zip(&walls.normals) {
         let (at, facing) = (pose.apply(p), pose.turn(n));

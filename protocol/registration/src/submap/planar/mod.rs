@@ -5,7 +5,7 @@
 //! [`describe()`] turns a submap into the same [`Features`](super::Features), keypoints and summary as in space, with
 //! points at z = 0 and normals in the plane, so that wire, store and negotiation stay as they are. [`register()`]
 //! tries *all* poses of their keypoints on a raster of my submap (`search`), because a floor plan of bare walls has
-//! no local features to speak of, and judges the best of them (`court`).
+//! no local features to speak of, and judges the best of them (`verifier`).
 //!
 //! **What is not known.** A laser at some height over some floor sees nothing of height, roll and pitch. An alignment
 //! says of them that both robots stand on about one floor ([`OUT_OF_PLANE_ALIGNED`]); the motion of a robot that does
@@ -14,25 +14,25 @@
 //!
 //! Lengths are in voxels unless said otherwise.
 
-mod chart;
-mod court;
+mod codec;
 mod describe;
 mod fit;
-mod flat;
 mod lines;
 mod motion;
 mod register;
+mod se2;
 mod search;
 #[cfg(test)]
 mod tests;
+mod verifier;
 
 pub use describe::describe;
 pub(super) use motion::Sharpener;
-pub use register::{FlatConfig, register};
+pub use register::{PlanarConfig, register};
 
 use crate::geometry::{PoseWithCovariance, Se3};
-use flat::in_plane;
-pub(super) use flat::{Flat, in_space, wrapped};
+use se2::in_plane;
+pub(super) use se2::{Se2, in_space, wrapped};
 
 /// Standard deviations of height (m) and of roll and pitch (rad) that an alignment claims: two robots on one floor,
 /// their lasers mounted and their floor laid as such things are.
@@ -44,10 +44,10 @@ pub const TILT_MAX: f64 = 0.17;
 
 /// What is left in the plane of a pose in space.
 pub(super) fn flat(pose: &Se3) -> Se3 {
-    Flat::of(pose, 1.0).se3(1.0)
+    Se2::of(pose, 1.0).se3(1.0)
 }
 
 /// What is left in the plane of a motion, by a body that stays in it.
 pub(super) fn flat_motion(motion: &PoseWithCovariance) -> PoseWithCovariance {
-    in_space(&Flat::of(&motion.pose, 1.0), 1.0, &in_plane(&motion.covariance, 1.0), OUT_OF_PLANE_DRIVEN)
+    in_space(&Se2::of(&motion.pose, 1.0), 1.0, &in_plane(&motion.covariance, 1.0), OUT_OF_PLANE_DRIVEN)
 }

@@ -4,8 +4,8 @@
 
 use super::OUT_OF_PLANE_DRIVEN;
 use super::fit::{Walls, system};
-use super::flat::{Flat, in_plane, in_space};
 use super::lines::lines;
+use super::se2::{Se2, in_plane, in_space};
 use crate::geometry::PoseWithCovariance;
 use nalgebra::{Matrix3, Vector2};
 use std::collections::VecDeque;
@@ -38,7 +38,7 @@ const CHI2_MAX: f64 = 25.9;
 #[derive(Clone, Debug, Default)]
 pub struct Sharpener {
     /// Scans in the body frame and `t_frame_body` of each, in the frame of the first.
-    recent: VecDeque<(Flat, Vec<Vector2<f64>>)>,
+    recent: VecDeque<(Se2, Vec<Vector2<f64>>)>,
 }
 
 impl Sharpener {
@@ -53,17 +53,17 @@ impl Sharpener {
         let scan = thinned(points, voxel);
         let Some(motion) = motion else {
             self.recent.clear();
-            self.keep(Flat::new(0.0, Vector2::zeros()), scan);
+            self.keep(Se2::new(0.0, Vector2::zeros()), scan);
             return None;
         };
-        let (odometry, prior) = (Flat::of(&motion.pose, voxel), in_plane(&motion.covariance, voxel));
-        let last = self.recent.back().map_or_else(|| Flat::new(0.0, Vector2::zeros()), |(pose, _)| *pose);
+        let (odometry, prior) = (Se2::of(&motion.pose, voxel), in_plane(&motion.covariance, voxel));
+        let last = self.recent.back().map_or_else(|| Se2::new(0.0, Vector2::zeros()), |(pose, _)| *pose);
         let (step, covariance) = self.fitted(&last, &odometry, &prior, &scan).unwrap_or((odometry, prior));
         self.keep(last.after(&step), scan);
         Some(in_space(&step, voxel, &covariance, OUT_OF_PLANE_DRIVEN))
     }
 
-    fn keep(&mut self, pose: Flat, scan: Vec<Vector2<f64>>) {
+    fn keep(&mut self, pose: Se2, scan: Vec<Vector2<f64>>) {
         self.recent.push_back((pose, scan));
         if self.recent.len() > SCANS {
             self.recent.pop_front();
@@ -71,7 +71,7 @@ impl Sharpener {
     }
 
     /// The walls of recent scans in the body frame of the last.
-    fn walls(&self, last: &Flat) -> Walls {
+    fn walls(&self, last: &Se2) -> Walls {
         let (mut points, mut from) = (Vec::new(), Vec::new());
         for (pose, scan) in &self.recent {
             let t_last_then = last.inverse().after(pose);
@@ -86,11 +86,11 @@ impl Sharpener {
 
     fn fitted(
         &self,
-        last: &Flat,
-        odometry: &Flat,
+        last: &Se2,
+        odometry: &Se2,
         prior: &Matrix3<f64>,
         scan: &[Vector2<f64>],
-    ) -> Option<(Flat, Matrix3<f64>)> {
+    ) -> Option<(Se2, Matrix3<f64>)> {
         let near = self.walls(last).near();
         // A single scan's far points lie too sparse for lines of their own: all that is known is that they face the sensor.
         let normals = scan.iter().map(|p| (-p).try_normalize(1e-9).unwrap_or_else(Vector2::x)).collect();

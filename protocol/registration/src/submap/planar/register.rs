@@ -6,12 +6,12 @@ use super::super::features::{Features, Keypoints, UNSEEN};
 use super::super::refine::{RefineError, Refined};
 use super::super::register::{RegisterError, Registered, check_comparable};
 use super::OUT_OF_PLANE_ALIGNED;
-use super::chart::{Beam, CELLS_MAX, Chart, EDGE};
-use super::court::{ALIKE, Court, Judged};
+use super::codec::{Beam, CELLS_MAX, Codec, EDGE};
 use super::describe::unpacked;
 use super::fit::{Walls, system};
-use super::flat::{Flat, in_space};
+use super::se2::{Se2, in_space};
 use super::search;
+use super::verifier::{ALIKE, Judged, PoseVerifier};
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 /// Farthest that a point may lie from its anchor along an axis, voxels.
@@ -37,7 +37,7 @@ const SIGMA_MAX: f64 = 10.0;
 
 /// When a planar alignment is refused.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FlatConfig {
+pub struct PlanarConfig {
     /// Least score, nats.
     pub score_min: f64,
     /// Least share of the keypoints on my walls.
@@ -48,7 +48,7 @@ pub struct FlatConfig {
     pub rival_ratio: f64,
 }
 
-impl Default for FlatConfig {
+impl Default for PlanarConfig {
     fn default() -> Self {
         Self { score_min: 38.0, fit_min: 0.3, contradiction_max: 0.1, rival_ratio: 0.55 }
     }
@@ -58,7 +58,7 @@ impl Default for FlatConfig {
 ///
 /// # Errors
 /// [`RegisterError`]: a refusal with its reason.
-pub fn register(theirs: &Keypoints, mine: &Features, config: &FlatConfig) -> Result<Registered, RegisterError> {
+pub fn register(theirs: &Keypoints, mine: &Features, config: &PlanarConfig) -> Result<Registered, RegisterError> {
     check_comparable(theirs, mine)?;
     let voxel = mine.voxel();
     let (their_surfels, my_surfels) = (theirs.surfels(), mine.surfels());
@@ -71,7 +71,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &FlatConfig) -> Res
     let (chart, their_chart) = (chart(mine, &my_surfels, &my_walls), their_chart(theirs, &their_surfels, voxel));
     let sample = sample(&my_walls, their_walls.points.len());
     let poses = search::poses(&their_walls, &my_walls, &chart);
-    let court = Court {
+    let verifier = PoseVerifier {
         theirs: &their_walls,
         middle: their_walls.middle(),
         their_chart: &their_chart,
@@ -79,7 +79,7 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &FlatConfig) -> Res
         mine: &sample,
         chart: &chart,
     };
-    let judged = court.judge(&poses);
+    let judged = verifier.judge(&poses);
     let passes = |j: &&Judged| {
         j.score >= config.score_min && j.fit() >= config.fit_min && j.contradiction() <= config.contradiction_max
     };
@@ -90,12 +90,12 @@ pub fn register(theirs: &Keypoints, mine: &Features, config: &FlatConfig) -> Res
     };
     // A rival need not pass itself: it is enough that it is credible.
     let credible = |j: &&Judged| j.fit() >= config.fit_min && j.contradiction() <= 2.0 * config.contradiction_max;
-    let rival = judged.iter().filter(credible).find(|j| court.rivals(&best.pose, &j.pose));
+    let rival = judged.iter().filter(credible).find(|j| verifier.rivals(&best.pose, &j.pose));
     let rival = rival.map_or(0.0, |rival| rival.score);
     if rival >= config.rival_ratio * best.score {
         return Err(RegisterError::Ambiguous { score: best.score, rival, elsewhere: false });
     }
-    let refined = refined(&court, &best.pose, voxel)?;
+    let refined = refined(&verifier, &best.pose, voxel)?;
     Ok(Registered {
         refined,
         support: best.hits as f64,
@@ -115,7 +115,7 @@ fn walls(surfels: &[Surfel], voxel: f64) -> Walls {
     Walls { points, normals }
 }
 
-fn chart(mine: &Features, surfels: &[Surfel], walls: &Walls) -> Chart {
+fn chart(mine: &Features, surfels: &[Surfel], walls: &Walls) -> Codec {
     let all: Vec<Vector2<f64>> = surfels.iter().map(|s| s.position.xy() / mine.voxel()).collect();
     let eyes: Vec<Vector2<f64>> = mine.viewpoints().iter().map(|p| p.xy() / mine.voxel()).collect();
     let beam = |((&to, s), &by): ((&Vector2<f64>, &Surfel), &u8)| {
@@ -123,11 +123,11 @@ fn chart(mine: &Features, surfels: &[Surfel], walls: &Walls) -> Chart {
         Some(Beam { from, to, normal: s.roughness.map(|_| s.normal.xy()) })
     };
     let beams: Vec<Beam> = all.iter().zip(surfels).zip(mine.seen_from()).filter_map(beam).collect();
-    Chart::new(walls, &all, &beams, BEAMS_MIN)
+    Codec::new(walls, &all, &beams, BEAMS_MIN)
 }
 
 /// What their beams passed through. They sent few of them, so one says as much as several of mine.
-fn their_chart(theirs: &Keypoints, surfels: &[Surfel], voxel: f64) -> Chart {
+fn their_chart(theirs: &Keypoints, surfels: &[Surfel], voxel: f64) -> Codec {
     let all: Vec<Vector2<f64>> = surfels.iter().map(|s| s.position.xy() / voxel).collect();
     let step = theirs.block.step();
     let beam = |((&to, s), stored): ((&Vector2<f64>, &Surfel), &Stored<PACKED_LEN>)| {
@@ -135,7 +135,7 @@ fn their_chart(theirs: &Keypoints, surfels: &[Surfel], voxel: f64) -> Chart {
         Some(Beam { from, to, normal: s.roughness.map(|_| s.normal.xy()) })
     };
     let beams: Vec<Beam> = all.iter().zip(surfels).zip(&theirs.block.points).filter_map(beam).collect();
-    Chart::new(&Walls::default(), &all, &beams, 1)
+    Codec::new(&Walls::default(), &all, &beams, 1)
 }
 
 /// Every so many of my points, about `count`.
@@ -145,12 +145,12 @@ fn sample(walls: &Walls, count: usize) -> Vec<Vector2<f64>> {
 }
 
 /// The pose with a covariance that reflects the walls.
-fn refined(court: &Court, pose: &Flat, voxel: f64) -> Result<Refined, RefineError> {
-    let system = system(court.theirs, court.near, pose, RADIUS, ALIKE);
+fn refined(verifier: &PoseVerifier, pose: &Se2, voxel: f64) -> Result<Refined, RefineError> {
+    let system = system(verifier.theirs, verifier.near, pose, RADIUS, ALIKE);
     // About the middle of their points, an angle as what it moves at their rim: so x, y and the angle compare.
-    let middle = court.middle;
-    let spread = court.theirs.points.iter().map(|p| (p - middle).norm_squared()).sum::<f64>();
-    let lever = (spread / court.theirs.points.len().max(1) as f64).sqrt().max(1.0);
+    let middle = verifier.middle;
+    let spread = verifier.theirs.points.iter().map(|p| (p - middle).norm_squared()).sum::<f64>();
+    let lever = (spread / verifier.theirs.points.len().max(1) as f64).sqrt().max(1.0);
     #[rustfmt::skip]
     let from_middle = Matrix3::new(
         1.0, 0.0, middle.y / lever,
@@ -159,7 +159,7 @@ fn refined(court: &Court, pose: &Flat, voxel: f64) -> Result<Refined, RefineErro
     );
     let (information, total) = system.leaning(&from_middle, LEAN_MIN);
     let share = information.iter().fold(f64::INFINITY, |least, (value, _)| least.min(*value)) / total.max(1e-9);
-    let overlap = system.pairs as f64 / court.theirs.points.len().max(1) as f64;
+    let overlap = system.pairs as f64 / verifier.theirs.points.len().max(1) as f64;
     let counted = (INDEPENDENT_MAX * overlap * overlap / system.pairs.max(1) as f64).min(1.0);
     let mut covariance = Matrix3::zeros();
     for (value, axis) in &information {

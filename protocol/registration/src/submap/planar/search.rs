@@ -1,11 +1,11 @@
 //! All poses of their keypoints on my chart, from coarse to fine. Rotations are those under which the two histograms of
 //! wall directions agree (Censi's Hough scan matching, 2005); for each of them every translation has a bound of how many
-//! keypoints can lie on my walls ([`Chart::reachable`], as in Olson 2009), and the most promising are looked at cell by
+//! keypoints can lie on my walls ([`Codec::reachable`], as in Olson 2009), and the most promising are looked at cell by
 //! cell.
 
-use super::chart::{Chart, EDGE, FREE, sector};
+use super::codec::{Codec, EDGE, FREE, sector};
 use super::fit::Walls;
-use super::flat::Flat;
+use super::se2::Se2;
 use core::f64::consts::TAU;
 use libm::atan2;
 use nalgebra::Vector2;
@@ -23,7 +23,7 @@ const SPAN: i32 = 4;
 /// Keypoints that count at first: an even cover.
 const COARSE_POINTS: usize = 128;
 /// The first so many...
-const GLANCED: usize = 32;
+const COARSE: usize = 32;
 /// ...of which so many must lie on walls for the rest to be looked at.
 const GLANCED_MIN: u32 = 6;
 /// Squares of translations that are looked at cell by cell.
@@ -44,7 +44,7 @@ struct Rotated {
 }
 
 /// Distinct poses `t_mine_theirs`, the most promising first.
-pub fn poses(theirs: &Walls, mine: &Walls, chart: &Chart) -> Vec<Flat> {
+pub fn poses(theirs: &Walls, mine: &Walls, chart: &Codec) -> Vec<Se2> {
     let coarse = chart.reachable(SPAN);
     let rotated: Vec<Rotated> = rotations(theirs, mine).into_iter().map(|angle| Rotated::new(angle, theirs)).collect();
     let mut squares: Vec<(u32, usize, [i32; 2])> = Vec::new();
@@ -75,14 +75,14 @@ pub fn poses(theirs: &Walls, mine: &Walls, chart: &Chart) -> Vec<Flat> {
     distinct(&found, &rotated, theirs, chart)
 }
 
-fn distinct(found: &[(f64, usize, [i32; 2])], rotated: &[Rotated], theirs: &Walls, chart: &Chart) -> Vec<Flat> {
+fn distinct(found: &[(f64, usize, [i32; 2])], rotated: &[Rotated], theirs: &Walls, chart: &Codec) -> Vec<Se2> {
     let middle = theirs.middle();
-    let mut poses: Vec<Flat> = Vec::new();
+    let mut poses: Vec<Se2> = Vec::new();
     for &(score, k, shift) in found {
         if score <= 0.0 || poses.len() == POSES_MAX {
             break;
         }
-        let pose = Flat::new(rotated[k].angle, chart.corner() + Vector2::from(shift).map(f64::from) * EDGE);
+        let pose = Se2::new(rotated[k].angle, chart.corner() + Vector2::from(shift).map(f64::from) * EDGE);
         if poses.iter().all(|other| pose.differs(other, &middle, SAME.0 * EDGE, SAME.1)) {
             poses.push(pose);
         }
@@ -92,7 +92,7 @@ fn distinct(found: &[(f64, usize, [i32; 2])], rotated: &[Rotated], theirs: &Wall
 
 impl Rotated {
     fn new(angle: f64, walls: &Walls) -> Self {
-        let turn = Flat::new(angle, Vector2::zeros());
+        let turn = Se2::new(angle, Vector2::zeros());
         let cell = |p: &Vector2<f64>| -> [i32; 2] { (turn.turn(p) / EDGE).map(|x| x.floor() as i32).into() };
         let cells: Vec<([i32; 2], u16)> =
             walls.points.iter().zip(&walls.normals).map(|(p, n)| (cell(p), sector(&turn.turn(n)))).collect();
@@ -103,22 +103,22 @@ impl Rotated {
         Self { angle, cells, low, high }
     }
 
-    fn bound(&self, coarse: &Chart, shift: [i32; 2]) -> u32 {
+    fn bound(&self, coarse: &Codec, shift: [i32; 2]) -> u32 {
         // The coarse chart begins one span earlier.
         let count = |some: &[([i32; 2], u16)]| {
             some.iter()
                 .filter(|(c, sector)| coarse.at([c[0] + shift[0] + SPAN, c[1] + shift[1] + SPAN]) & sector != 0)
                 .count() as u32
         };
-        let (first, rest) = self.cells.split_at(self.cells.len().min(GLANCED));
+        let (first, rest) = self.cells.split_at(self.cells.len().min(COARSE));
         let seen = count(first);
         if seen < GLANCED_MIN {
             return 0;
         }
-        seen + count(&rest[..rest.len().min(COARSE_POINTS - GLANCED)])
+        seen + count(&rest[..rest.len().min(COARSE_POINTS - COARSE)])
     }
 
-    fn score(&self, chart: &Chart, shift: [i32; 2]) -> f64 {
+    fn score(&self, chart: &Codec, shift: [i32; 2]) -> f64 {
         let value = |(c, sector): &([i32; 2], u16)| {
             let cell = chart.at([c[0] + shift[0], c[1] + shift[1]]);
             if cell & sector != 0 {

@@ -2,8 +2,8 @@
 
 use super::super::runs::Runs;
 use super::super::{CovarianceOf, Described, Keyframe, KeyframeError, RegisterError, Registered, SubmapBuilder};
-use super::flat::{Flat, in_plane, in_space};
-use super::{FlatConfig, OUT_OF_PLANE_ALIGNED, TILT_MAX, register};
+use super::se2::{Se2, in_plane, in_space};
+use super::{OUT_OF_PLANE_ALIGNED, PlanarConfig, TILT_MAX, register};
 use crate::config::{Sensor, SubmapConfig};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use crate::time::Stamp;
@@ -41,9 +41,9 @@ fn corridor(ends: bool) -> Vec<Wall> {
 }
 
 /// What a laser at `pose` sees all around, body frame: a beam each half degree, up to 15 m.
-fn scan(pose: &Flat, walls: &[Wall]) -> Vec<[f32; 3]> {
+fn scan(pose: &Se2, walls: &[Wall]) -> Vec<[f32; 3]> {
     let beam = |k: i32| {
-        let way = Flat::new(f64::from(k) * 0.5_f64.to_radians(), Vector2::zeros()).turn(&Vector2::x());
+        let way = Se2::new(f64::from(k) * 0.5_f64.to_radians(), Vector2::zeros()).turn(&Vector2::x());
         let world = pose.turn(&way);
         let hit = |[a, b]: &Wall| {
             let (a, b) = (Vector2::from(*a) - pose.at, Vector2::from(*b) - pose.at);
@@ -75,26 +75,26 @@ fn keyframe(stamp: i64, pose: Se3, sigma: f64, points: Vec<[f32; 3]>) -> Keyfram
 }
 
 /// A drive along places of the plan, seen in a frame `t_frame_plan`; and `t_plan_anchor`.
-fn driven(walls: &[Wall], way: &[Flat]) -> (Described, Flat) {
+fn driven(walls: &[Wall], way: &[Se2]) -> (Described, Se2) {
     let mut builder = SubmapBuilder::new(config());
     for (k, pose) in (1..).zip(way) {
         builder.push(keyframe(k, pose.se3(1.0), 0.02, scan(pose, walls))).unwrap();
     }
     let submap = builder.flush().unwrap();
-    (super::super::describe(&submap, &config()), Flat::of(&submap.t_frame_anchor, 1.0))
+    (super::super::describe(&submap, &config()), Se2::of(&submap.t_frame_anchor, 1.0))
 }
 
 /// From a place in steps of 0.3 m.
-fn way(x: f64, y: f64, heading: f64, steps: i32) -> Vec<Flat> {
-    (0..steps).map(|k| Flat::new(heading, Vector2::new(x, y)).after(&ahead(0.3 * f64::from(k)))).collect()
+fn way(x: f64, y: f64, heading: f64, steps: i32) -> Vec<Se2> {
+    (0..steps).map(|k| Se2::new(heading, Vector2::new(x, y)).after(&ahead(0.3 * f64::from(k)))).collect()
 }
 
-fn ahead(x: f64) -> Flat {
-    Flat::new(0.0, Vector2::new(x, 0.0))
+fn ahead(x: f64) -> Se2 {
+    Se2::new(0.0, Vector2::new(x, 0.0))
 }
 
-fn aligned(a: &(Described, Flat), b: &(Described, Flat)) -> Result<Registered, RegisterError> {
-    register(&a.0.keypoints, &b.0.features, &FlatConfig::default())
+fn aligned(a: &(Described, Se2), b: &(Described, Se2)) -> Result<Registered, RegisterError> {
+    register(&a.0.keypoints, &b.0.features, &PlanarConfig::default())
 }
 
 #[test]
@@ -106,7 +106,7 @@ fn a_hall_is_recognised_from_elsewhere_and_the_covariance_covers_the_error() {
     let near = first.surfels();
     assert!(further.surfels().iter().all(|one| !near.contains(one)) && first.further().is_some());
     let both = first.with_further(further).unwrap();
-    assert!(register(&both, &back.0.features, &FlatConfig::default()).is_ok());
+    assert!(register(&both, &back.0.features, &PlanarConfig::default()).is_ok());
     for (theirs, mine) in [(&there, &back), (&back, &there)] {
         let found = aligned(theirs, mine).unwrap();
         let truth = (mine.1.inverse().after(&theirs.1)).se3(1.0);
@@ -147,14 +147,14 @@ fn other_places_and_submaps_in_space_are_refused() {
     let elsewhere = driven(&other, &way(-3.0, 0.0, 0.0, 14));
     assert!(aligned(&here, &elsewhere).is_err() && aligned(&elsewhere, &here).is_err());
     let room = super::super::testing::room(1);
-    assert_eq!(register(&room.keypoints, &here.0.features, &FlatConfig::default()), Err(RegisterError::NotPlanar));
-    assert_eq!(register(&here.0.keypoints, &room.features, &FlatConfig::default()), Err(RegisterError::NotPlanar));
+    assert_eq!(register(&room.keypoints, &here.0.features, &PlanarConfig::default()), Err(RegisterError::NotPlanar));
+    assert_eq!(register(&here.0.keypoints, &room.features, &PlanarConfig::default()), Err(RegisterError::NotPlanar));
 }
 
 /// Wheels that claim a tenth too much: in a hall the scans put it right, in a corridor nobody can know.
 #[test]
 fn scans_sharpen_motion_where_they_can_and_say_so_where_not() {
-    let driven = |walls: &[Wall], start: Flat| {
+    let driven = |walls: &[Wall], start: Se2| {
         let mut builder = SubmapBuilder::new(config());
         for k in 0..12 {
             let (true_way, told) = (0.3 * f64::from(k), 0.33 * f64::from(k));
@@ -165,9 +165,9 @@ fn scans_sharpen_motion_where_they_can_and_say_so_where_not() {
         let moved = submap.keyframes[0].inverse() * submap.keyframes[11];
         (moved.translation.x, submap.odometry.covariance.sigmas()[0])
     };
-    let (hall, sure) = driven(&hall(), Flat::new(0.1, Vector2::new(1.0, 1.0)));
+    let (hall, sure) = driven(&hall(), Se2::new(0.1, Vector2::new(1.0, 1.0)));
     assert!((hall - 3.3).abs() < 0.05, "{hall}");
-    let (corridor, unsure) = driven(&corridor(false), Flat::new(0.0, Vector2::zeros()));
+    let (corridor, unsure) = driven(&corridor(false), Se2::new(0.0, Vector2::zeros()));
     assert!((corridor - 3.63).abs() < 0.05, "{corridor}");
     assert!(unsure > 2.0 * sure, "{unsure} {sure}");
 }
@@ -198,7 +198,7 @@ fn a_restart_is_as_uncertain_as_the_way_before_it_was_long() {
 proptest! {
     #[test]
     fn poses_in_the_plane_compose_as_in_space(a in -4.0..4.0f64, x in -9.0..9.0f64, y in -9.0..9.0f64, b in -4.0..4.0f64) {
-        let (p, q) = (Flat::new(a, Vector2::new(x, y)), Flat::new(b, Vector2::new(y, -x)));
+        let (p, q) = (Se2::new(a, Vector2::new(x, y)), Se2::new(b, Vector2::new(y, -x)));
         prop_assert!(p.after(&q).se3(0.5).local(&(p.se3(0.5) * q.se3(0.5))).amax() < 1e-9);
         prop_assert!(p.inverse().se3(2.0).local(&p.se3(2.0).inverse()).amax() < 1e-9);
         prop_assert!(p.local(&p.retract(&Vector3::new(0.1, 0.2, 0.3))).z - 0.3 < 1e-9);

@@ -11,8 +11,8 @@ use std::collections::BTreeSet;
 /// The anchor that has a cloud.
 const MIDDLE: u32 = 1;
 
-fn walk() -> Walk {
-    Walk { whole: sigmas(0.1, 0.03), keyframes: NonZero::new(4) }
+fn walk() -> DriftModel {
+    DriftModel { whole: sigmas(0.1, 0.03), keyframes: NonZero::new(4) }
 }
 
 fn any_measured(rng: &mut ChaCha8Rng) -> PoseWithCovariance {
@@ -24,7 +24,7 @@ fn any_measured(rng: &mut ChaCha8Rng) -> PoseWithCovariance {
 fn chain(rng: &mut ChaCha8Rng) -> (Graph, Vec<Sim3>) {
     let cloud = SubmapId { index: 1 << 31 | MIDDLE, ..submap(0, 0) };
     let steps: [PoseWithCovariance; 2] = core::array::from_fn(|_| any_measured(rng));
-    let (left, gains) = owed(&sigmas(0.02, 0.01), &walk(), [Some(&steps[0]), Some(&steps[1])]);
+    let (left, gains) = conditional_covariance(&sigmas(0.02, 0.01), &walk(), [Some(&steps[0]), Some(&steps[1])]);
     let factor = |label, i, j, t: PoseWithCovariance| Factor { label, i, j, t_i_j: Relative::Metric(t), weight: 1.0 };
     let at = PoseWithCovariance { pose: Se3::identity(), covariance: left };
     let seen = measured(rng, &steps[0].pose, sigmas(0.05, 0.02));
@@ -127,9 +127,9 @@ fn what_is_left_of_a_cloud_is_less_and_positive() {
     let mut rng = rng(5);
     let common = sigmas(0.02, 0.01);
     for keyframes in (1..12).map(NonZero::new).chain([None]) {
-        let walk = Walk { keyframes, ..walk() };
+        let walk = DriftModel { keyframes, ..walk() };
         let [to, from]: [PoseWithCovariance; 2] = core::array::from_fn(|_| any_measured(&mut rng));
-        let volume = |steps| owed(&common, &walk, steps).0.matrix().determinant();
+        let volume = |steps| conditional_covariance(&common, &walk, steps).0.matrix().determinant();
         let alone = volume([None, None]);
         let least = (1.0 - 1e-9) * common.matrix().determinant();
         assert_eq!(volume([Some(&to), None]) < alone, walk.before_anchor().is_some(), "{keyframes:?}");

@@ -1,4 +1,4 @@
-//! How soon a message may go out: a purse that fills slowly lets a few go at once and holds back a stream of them, and
+//! How soon a message may go out: a bucket of tokens that fills slowly lets a few go at once and holds back a stream of them, and
 //! a message that moves much pays for itself.
 
 use crate::time::Instant;
@@ -48,9 +48,9 @@ impl Bucket {
 
 /// A bucket of coins.
 #[derive(Clone, Debug)]
-pub(super) struct Purse(Bucket);
+pub(super) struct TokenBucket(Bucket);
 
-impl Purse {
+impl TokenBucket {
     pub fn new(coins_per_sec: f64, coins_max: f64, now: Instant) -> Self {
         Self(Bucket::new(coins_per_sec, coins_max, now))
     }
@@ -77,7 +77,7 @@ impl Purse {
         self.0.set(now, (level + copies * price(facts)).min(level.max(self.0.full())));
     }
 
-    /// Much was moved at once: now the purse holds twice what fills it otherwise.
+    /// Much was moved at once: now the bucket holds twice what fills it otherwise.
     pub fn refill(&mut self, now: Instant) {
         self.0.set(now, 2.0 * self.0.full());
     }
@@ -95,36 +95,36 @@ mod tests {
     #[test]
     fn what_was_lost_is_given_back_and_not_more() {
         let now = Instant::ZERO;
-        let mut purse = Purse::new(1.0, 2.0, now);
-        purse.give_back(now, 1.0, 1.0);
-        assert_eq!(purse.0.level(now), 2.0, "a full purse stays full");
-        purse.pay(now, 1.0, 1.0);
-        purse.pay(now, 1.0, 1.0);
-        assert!(purse.due(now, 1.0, 1.0) > now);
-        purse.give_back(now, 1.0, 1.0);
-        assert_eq!(purse.due(now, 1.0, 1.0), now);
-        assert_eq!(purse.0.level(now), 1.0);
+        let mut bucket = TokenBucket::new(1.0, 2.0, now);
+        bucket.give_back(now, 1.0, 1.0);
+        assert_eq!(bucket.0.level(now), 2.0, "a full bucket stays full");
+        bucket.pay(now, 1.0, 1.0);
+        bucket.pay(now, 1.0, 1.0);
+        assert!(bucket.due(now, 1.0, 1.0) > now);
+        bucket.give_back(now, 1.0, 1.0);
+        assert_eq!(bucket.due(now, 1.0, 1.0), now);
+        assert_eq!(bucket.0.level(now), 1.0);
     }
 
     #[test]
     fn what_follows_a_large_gain_need_not_wait() {
         let now = Instant::ZERO;
-        let mut purse = Purse::new(1.0, 2.0, now);
-        let at_once = |purse: &mut Purse| {
+        let mut bucket = TokenBucket::new(1.0, 2.0, now);
+        let at_once = |bucket: &mut TokenBucket| {
             let mut count = 0;
-            while purse.due(now, 1.0, 1.0) <= now {
-                purse.pay(now, 1.0, 1.0);
+            while bucket.due(now, 1.0, 1.0) <= now {
+                bucket.pay(now, 1.0, 1.0);
                 count += 1;
             }
             count
         };
-        assert_eq!(at_once(&mut purse), 2);
-        purse.refill(now);
-        assert_eq!(at_once(&mut purse), 4);
-        purse.refill(now);
+        assert_eq!(at_once(&mut bucket), 2);
+        bucket.refill(now);
+        assert_eq!(at_once(&mut bucket), 4);
+        bucket.refill(now);
         let later = now.after(Duration::from_secs(100));
-        assert!(purse.0.level(later) <= 4.0, "what it holds beyond its fill does not grow");
-        purse.pay(later, 1.0, 4.0);
-        assert!(purse.0.level(later.after(Duration::from_secs(100))) <= 2.0);
+        assert!(bucket.0.level(later) <= 4.0, "what it holds beyond its fill does not grow");
+        bucket.pay(later, 1.0, 4.0);
+        assert!(bucket.0.level(later.after(Duration::from_secs(100))) <= 2.0);
     }
 }

@@ -47,7 +47,7 @@ struct Stored {
 
 /// Landmarks with their scales, most important first.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Chart {
+pub struct Codec {
     voxel: f32,
     step: f32,
     /// Upper triangle.
@@ -55,7 +55,7 @@ pub struct Chart {
     landmarks: Vec<Stored>,
 }
 
-impl Chart {
+impl Codec {
     /// The landmarks that can be stored: those too far out are left out.
     pub fn new(voxel: f64, constellation: &Constellation) -> Self {
         let Constellation { landmarks, common } = constellation;
@@ -184,7 +184,7 @@ impl Chart {
     }
 
     /// Parses bytes that claim to be landmarks of the kind `magic`, at most `count_max`. Accepts exactly what
-    /// [`Chart::encode`] writes.
+    /// [`Codec::encode`] writes.
     ///
     /// # Errors
     /// [`BlockError`], naming the first check that failed.

@@ -2,7 +2,7 @@
 //!
 //! What a similarity of summaries is worth depends on the place and the sensor: of pairs of scans alike by 0.92 a
 //! tenth overlapped along two streets, two fifths in a hall, all in one room. So every robot learns it from its own
-//! tries: a logistic regression on the [`Signs`] of a pair, Bayesian, one Newton step from the mean for each outcome (the
+//! tries: a logistic regression on the [`OverlapFeatures`] of a pair, Bayesian, one Newton step from the mean for each outcome (the
 //! extended Kalman filter of a Bernoulli variable; Spiegelhalter & Lauritzen 1990), with the predictive probability
 //! of MacKay 1992, `σ(μ / √(1 + π s² / 8))`. It begins from what is usual of a sensor, loosely held.
 
@@ -10,7 +10,7 @@ use crate::config::Sensor;
 use crate::submap::{Looks, Similarity};
 use nalgebra::{SMatrix, SVector};
 
-/// Numbers that the signs of a pair amount to: one, similarity, whether the place is known, distance.
+/// Numbers that the features of a pair amount to: one, similarity, whether the place is known, distance.
 const DIMENSIONS: usize = 4;
 /// Standard deviations of their weights before anything was tried, but for that of the similarity, which [`Usual`] has.
 const SIGMA: [f64; DIMENSIONS - 1] = [1.5, 1.5, 6.0];
@@ -24,7 +24,7 @@ type Matrix = SMatrix<f64, DIMENSIONS, DIMENSIONS>;
 
 /// What is known of a pair of submaps before it is tried.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Signs {
+pub(super) struct OverlapFeatures {
     /// Of the summaries.
     pub similarity: Similarity,
     /// By the joint estimate: distance of the anchors by that at which the submaps just touch, 0 to 1; `None` where
@@ -34,16 +34,16 @@ pub(super) struct Signs {
 
 /// What follows from it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Guess {
+pub(super) struct Prediction {
     /// From this.
-    pub signs: Signs,
+    pub features: OverlapFeatures,
     /// That the two can be aligned.
     pub probability: f64,
 }
 
 /// What was learned of what came of tries: what summaries of ours are worth, and what the user's own descriptors are.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Promise {
+pub(super) struct OverlapModel {
     by_summary: Regression,
     by_place: Regression,
 }
@@ -95,26 +95,26 @@ impl Usual {
     }
 }
 
-impl Promise {
+impl OverlapModel {
     /// Nothing was tried yet of what this sensor sees.
     pub fn new(sensor: Sensor) -> Self {
         Self { by_summary: Regression::new(Usual::of(sensor)), by_place: Regression::new(Usual::of_places()) }
     }
 
     /// How probable it is that a pair can be aligned.
-    pub fn guess(&self, signs: Signs) -> Guess {
-        let regression = match signs.similarity.by {
+    pub fn predict(&self, features: OverlapFeatures) -> Prediction {
+        let regression = match features.similarity.by {
             Looks::Summary => &self.by_summary,
             Looks::Place => &self.by_place,
         };
-        Guess { signs, probability: regression.probability(&signs) }
+        Prediction { features, probability: regression.probability(&features) }
     }
 
     /// Takes what came of a try.
-    pub fn learn(&mut self, signs: &Signs, aligned: bool) {
-        match signs.similarity.by {
-            Looks::Summary => self.by_summary.learn(signs, aligned),
-            Looks::Place => self.by_place.learn(signs, aligned),
+    pub fn learn(&mut self, features: &OverlapFeatures, aligned: bool) {
+        match features.similarity.by {
+            Looks::Summary => self.by_summary.learn(features, aligned),
+            Looks::Place => self.by_place.learn(features, aligned),
         }
     }
 }
@@ -124,19 +124,19 @@ impl Regression {
         Self { usual, mean: [usual.odds, usual.slope, NEAR.0, NEAR.1].into(), covariance: usual.prior() }
     }
 
-    fn probability(&self, signs: &Signs) -> f64 {
-        let x = self.numbers(signs);
+    fn probability(&self, features: &OverlapFeatures) -> f64 {
+        let x = self.numbers(features);
         let variance = x.dot(&(self.covariance * x));
         logistic(self.mean.dot(&x) / (1.0 + core::f64::consts::PI * variance / 8.0).sqrt())
     }
 
-    fn numbers(&self, signs: &Signs) -> Vector {
-        let similarity = (signs.similarity.value - self.usual.similarity) / self.usual.spread;
-        Vector::from([1.0, similarity, signs.apart.map_or(0.0, |_| 1.0), signs.apart.unwrap_or(0.0)])
+    fn numbers(&self, features: &OverlapFeatures) -> Vector {
+        let similarity = (features.similarity.value - self.usual.similarity) / self.usual.spread;
+        Vector::from([1.0, similarity, features.apart.map_or(0.0, |_| 1.0), features.apart.unwrap_or(0.0)])
     }
 
-    fn learn(&mut self, signs: &Signs, aligned: bool) {
-        let x = self.numbers(signs);
+    fn learn(&mut self, features: &OverlapFeatures, aligned: bool) {
+        let x = self.numbers(features);
         self.covariance += self.usual.prior() * FORGET;
         let expected = logistic(self.mean.dot(&x));
         let certain = expected * (1.0 - expected);
@@ -153,5 +153,5 @@ fn logistic(x: f64) -> f64 {
 }
 
 #[cfg(test)]
-#[path = "promise_tests.rs"]
+#[path = "overlap_model_tests.rs"]
 mod tests;

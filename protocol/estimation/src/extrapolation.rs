@@ -19,8 +19,8 @@
 //! alignments are surer than their odometry (σ of 8 mm): without it the relations of frames have a NEES of 0.80 by degrees
 //! of freedom.
 
+use super::drift_model::Stretch;
 use super::solve::Solution;
-use super::walk::Stretch;
 use crate::geometry::{Covariance, PoseWithCovariance};
 use crate::ids::SubmapId;
 use nalgebra::Matrix6;
@@ -70,5 +70,5 @@ impl End {
 }
 
 #[cfg(test)]
-#[path = "ends_tests.rs"]
+#[path = "extrapolation_tests.rs"]
 mod tests;

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 
 /// Where described submaps truly lie, by what was described.
 #[derive(Debug)]
-pub struct StandIn {
+pub struct AlignmentOracle {
     options: SummaryOptions,
     seed: u64,
     /// By the hash of features and of keypoints.
@@ -29,7 +29,7 @@ struct Place {
     bent: Vector6<f64>,
 }
 
-impl StandIn {
+impl AlignmentOracle {
     /// Knows nothing yet.
     pub fn new(options: SummaryOptions, seed: u64) -> Self {
         Self { options, seed, places: BTreeMap::new() }
@@ -131,7 +131,7 @@ mod tests {
     use std::sync::Arc;
 
     /// Describes a scan of so many points on a wall, made at `x`.
-    fn described(standin: &mut StandIn, points: usize, x: f64) -> Described {
+    fn described(oracle: &mut AlignmentOracle, points: usize, x: f64) -> Described {
         let config = SubmapConfig { keypoints: 16, keypoints_further: 16, ..SubmapConfig::default() };
         let mut builder = SubmapBuilder::new(config.clone());
         let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
@@ -151,14 +151,14 @@ mod tests {
         builder.push(keyframe).unwrap();
         let job = Job::Describe(Box::new(DescribeJob { submap: builder.flush().unwrap(), config }));
         let there = Se3::new(Se3::identity().rotation, [x, 0.0, 0.0].into());
-        match standin.run("alpha", job, |_| Some(there)).0 {
+        match oracle.run("alpha", job, |_| Some(there)).0 {
             JobResult::Described(described) => described.1,
             other => panic!("{other:?}"),
         }
     }
 
     fn align(
-        standin: &mut StandIn,
+        oracle: &mut AlignmentOracle,
         mine: &Described,
         theirs: &Described,
         seed: u64,
@@ -174,7 +174,7 @@ mod tests {
             scale: ScaleKind::Metric,
             seed,
         };
-        match standin.run("alpha", Job::Align(Box::new(job)), |_| None).0 {
+        match oracle.run("alpha", Job::Align(Box::new(job)), |_| None).0 {
             JobResult::Aligned(answer) => answer.map_err(|why| why.reason),
             other => panic!("{other:?}"),
         }
@@ -183,18 +183,18 @@ mod tests {
     #[test]
     fn submaps_without_keypoints_align_with_nothing() {
         for (points, aligned) in [(1, false), (400, true)] {
-            let mut standin = StandIn::new(SummaryOptions::default(), 1);
-            let [mine, theirs] = [0.0, 2.0].map(|x| described(&mut standin, points, x));
-            assert_eq!(align(&mut standin, &mine, &theirs, 1).is_ok(), aligned, "{points} points");
+            let mut oracle = AlignmentOracle::new(SummaryOptions::default(), 1);
+            let [mine, theirs] = [0.0, 2.0].map(|x| described(&mut oracle, points, x));
+            assert_eq!(align(&mut oracle, &mine, &theirs, 1).is_ok(), aligned, "{points} points");
         }
     }
 
     #[test]
     fn both_ends_find_the_same() {
-        let mut standin = StandIn::new(SummaryOptions { common: 0.2, ..SummaryOptions::default() }, 1);
-        let [one, other] = [0.0, 2.0].map(|x| described(&mut standin, 100, x));
+        let mut oracle = AlignmentOracle::new(SummaryOptions { common: 0.2, ..SummaryOptions::default() }, 1);
+        let [one, other] = [0.0, 2.0].map(|x| described(&mut oracle, 100, x));
         let [there, back] = [(&one, &other, 1), (&other, &one, 2)].map(|(mine, theirs, seed)| {
-            let found = align(&mut standin, mine, theirs, seed).unwrap().t_mine_theirs;
+            let found = align(&mut oracle, mine, theirs, seed).unwrap().t_mine_theirs;
             found.metric().unwrap().pose
         });
         let truth = Se3::new(Se3::identity().rotation, [2.0, 0.0, 0.0].into());
@@ -206,15 +206,15 @@ mod tests {
     #[test]
     fn what_is_refused_at_first_is_found_at_a_second_look() {
         let options = SummaryOptions { refused_at_first: 1.0, ..SummaryOptions::default() };
-        let mut standin = StandIn::new(options, 1);
-        let [one, other] = [0.0, 2.0].map(|x| described(&mut standin, 400, x));
-        assert!(matches!(align(&mut standin, &one, &other, 1), Err(RefusalReason::NoConsensus)));
-        assert!(matches!(align(&mut standin, &other, &one, 1), Err(RefusalReason::NoConsensus)));
+        let mut oracle = AlignmentOracle::new(options, 1);
+        let [one, other] = [0.0, 2.0].map(|x| described(&mut oracle, 400, x));
+        assert!(matches!(align(&mut oracle, &one, &other, 1), Err(RefusalReason::NoConsensus)));
+        assert!(matches!(align(&mut oracle, &other, &one, 1), Err(RefusalReason::NoConsensus)));
         let [one, other] = [one, other].map(|described| {
             let keypoints = described.keypoints.with_further(&described.further.unwrap()).unwrap();
             Described { keypoints, further: None, ..described }
         });
-        assert!(align(&mut standin, &one, &other, 1).is_ok() && align(&mut standin, &other, &one, 1).is_ok());
+        assert!(align(&mut oracle, &one, &other, 1).is_ok() && align(&mut oracle, &other, &one, 1).is_ok());
     }
 
     #[test]
@@ -234,10 +234,10 @@ mod tests {
             let runs = 400;
             for seed in 0..runs {
                 let options = SummaryOptions { common, ..SummaryOptions::default() };
-                let mut standin = StandIn::new(options, seed);
-                let [one, two, three] = [0.0, 2.0, 4.0].map(|x| described(&mut standin, 100, x));
+                let mut oracle = AlignmentOracle::new(options, seed);
+                let [one, two, three] = [0.0, 2.0, 4.0].map(|x| described(&mut oracle, 100, x));
                 let mut whitened = |mine: &Described, x: f64, seed| {
-                    let t = align(&mut standin, mine, &two, seed).unwrap().t_mine_theirs;
+                    let t = align(&mut oracle, mine, &two, seed).unwrap().t_mine_theirs;
                     let t = t.metric().unwrap();
                     let truth = Se3::new(Se3::identity().rotation, [x, 0.0, 0.0].into());
                     let off = truth.local(&t.pose);

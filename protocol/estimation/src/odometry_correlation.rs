@@ -1,5 +1,5 @@
 //! What a cloud owes to the odometry on either side of its anchor. Of the error d of where the cloud lies by its anchor, a
-//! part is told by what the steps to and from the anchor are off by, which bent it ([`walk`](super::walk)): with `r_k` and
+//! part is told by what the steps to and from the anchor are off by, which bent it ([`walk`](super::drift_model)): with `r_k` and
 //! `r_{k+1}` the residuals of these steps and Σ their covariances, the cloud's factor is that of
 //! `d − Cov(d, r_k) Σ_k⁻¹ r_k − Cov(d, r_{k+1}) Σ_{k+1}⁻¹ r_{k+1}`, of what is then left of d's covariance: a factor of four
 //! nodes. What neighbouring clouds still have in common, by the step between them, is left out.
@@ -8,8 +8,8 @@
 //! of 0.2, 1 and 4 times the walk's variance: anchors amid the chain have 1.02, 1.01 and 1.00 of the variance that they
 //! claim. Without it they have 1.27, 1.13 and 1.04, and 6, 2 and 1 % more than with it.
 
+use super::drift_model::{DriftModel, Stretch};
 use super::graph::{Edge, Graph, Label};
-use super::walk::{Stretch, Walk};
 use crate::geometry::{Covariance, PoseWithCovariance, Sim3};
 use crate::ids::SubmapId;
 use nalgebra::{Matrix6, Vector6};
@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 /// The odometry around an anchor.
 pub(super) struct Around<'a> {
     /// While its submap was made.
-    pub(super) walk: Walk,
+    pub(super) walk: DriftModel,
     /// To the anchor and from it, in a frame whose unit is known.
     pub(super) steps: [Option<&'a PoseWithCovariance>; 2],
 }
@@ -28,9 +28,9 @@ pub(super) type Gains = [Option<Matrix6<f64>>; 2];
 
 /// The covariance of how a cloud lies by its anchor, given the residuals of the steps to and from it; of those, that it
 /// follows. `common` is what alignments have in common but for the walk.
-pub(super) fn owed(
+pub(super) fn conditional_covariance(
     common: &Covariance<6>,
-    walk: &Walk,
+    walk: &DriftModel,
     [to, from]: [Option<&PoseWithCovariance>; 2],
 ) -> (Covariance<6>, Gains) {
     let Some(drift) = walk.off_anchor() else { return (*common, [None; 2]) };
@@ -155,5 +155,5 @@ impl Graph {
 }
 
 #[cfg(test)]
-#[path = "bend_tests.rs"]
+#[path = "odometry_correlation_tests.rs"]
 mod tests;

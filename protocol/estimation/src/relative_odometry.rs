@@ -6,17 +6,17 @@ use crate::geometry::Se3;
 use nalgebra::Matrix6;
 
 /// A pose and the covariance of the odometry that leads there; zero where none does.
-pub(super) type Way = (Se3, Matrix6<f64>);
+pub(super) type OdometryStep = (Se3, Matrix6<f64>);
 
-/// Ways between distinct anchors of one trajectory.
-pub(super) struct Ways {
+/// RelativeOdometry between distinct anchors of one trajectory.
+pub(super) struct RelativeOdometry {
     /// The distinct anchors, ascending.
     distinct: Vec<usize>,
     /// From each distinct anchor to the next.
-    steps: Vec<Way>,
+    steps: Vec<OdometryStep>,
 }
 
-impl Ways {
+impl RelativeOdometry {
     /// Between those of these anchors that the trajectory has.
     pub(super) fn new(trajectory: &Trajectory, anchors: impl Iterator<Item = usize>) -> Self {
         let mut distinct: Vec<usize> = anchors.filter(|&anchor| anchor < trajectory.len()).collect();
@@ -32,7 +32,7 @@ impl Ways {
     }
 
     /// Every distinct anchor relative to the one at position `own`; none if there is no such anchor.
-    pub(super) fn from(&self, own: usize) -> Vec<Way> {
+    pub(super) fn from(&self, own: usize) -> Vec<OdometryStep> {
         if own >= self.distinct.len() {
             return Vec::new();
         }
@@ -48,13 +48,13 @@ impl Ways {
 }
 
 /// One way, and then another.
-pub(super) fn compose((a, sigma_a): &Way, (b, sigma_b): &Way) -> Way {
+pub(super) fn compose((a, sigma_a): &OdometryStep, (b, sigma_b): &OdometryStep) -> OdometryStep {
     let m = b.inverse().adjoint();
     (*a * *b, m * sigma_a * m.transpose() + sigma_b)
 }
 
 /// The way back.
-pub(super) fn inverse((a, sigma): &Way) -> Way {
+pub(super) fn inverse((a, sigma): &OdometryStep) -> OdometryStep {
     let m = a.adjoint();
     (a.inverse(), m * sigma * m.transpose())
 }
@@ -71,7 +71,7 @@ mod tests {
         let step = |_| PoseWithCovariance { pose: pose(&mut rng), covariance: covariance::<6>(&mut rng).scaled(1e-2) };
         let trajectory = Trajectory::new((0..9).map(step).collect::<Vec<_>>());
         let anchors = [7, 2, 2, 0, 5, 7, 12];
-        let ways = Ways::new(&trajectory, anchors.into_iter());
+        let ways = RelativeOdometry::new(&trajectory, anchors.into_iter());
         for from in [0, 2, 5, 7] {
             let all = ways.from(ways.slot(from));
             assert_eq!(all.len(), 4);
@@ -84,6 +84,9 @@ mod tests {
                 assert!(back.local(&expected).norm() < 1e-12 && (sigma - of_it).amax() < 1e-12 * (1.0 + of_it.amax()));
             }
         }
-        assert!(ways.from(ways.slot(12)).is_empty() && Ways::new(&trajectory, [].into_iter()).from(0).is_empty());
+        assert!(
+            ways.from(ways.slot(12)).is_empty()
+                && RelativeOdometry::new(&trajectory, [].into_iter()).from(0).is_empty()
+        );
     }
 }

@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 use std::collections::BTreeSet;
 
 /// Keypoints that a pose is first judged by: an even cover...
-const GLANCED: usize = 32;
+const COARSE: usize = 32;
 /// ...and, if it is among the first so many...
 const GLANCED_AGAIN: usize = 400;
 /// ...keypoints that it is judged by once more.
@@ -55,7 +55,7 @@ const POINTS_PER_MEASUREMENT: f64 = 3.0;
 /// What a keypoint with a match that agrees with the pose adds: under a wrong pose one in a hundred has one, under a right
 /// one at least one in twenty.
 const SUPPORT_GAIN: f64 = 3.0;
-/// What it takes at first glance, in confirmed points.
+/// What it takes at first coarse_score, in confirmed points.
 const GLANCE_COST: f64 = 2.0;
 /// Poses that differ by more than this distance (voxels) or angle (rad) rival each other.
 const RIVAL: (f64, f64) = (4.0, 0.15);
@@ -95,7 +95,7 @@ impl Judged {
 }
 
 /// All that is needed to judge poses of one pair.
-pub struct Court<'a> {
+pub struct PoseVerifier<'a> {
     theirs: &'a Cloud,
     mine: &'a Cloud,
     matches: &'a [Pairing],
@@ -108,7 +108,7 @@ pub struct Court<'a> {
     often: Vec<u32>,
 }
 
-impl<'a> Court<'a> {
+impl<'a> PoseVerifier<'a> {
     /// About to judge `poses`, each of which tells what chance does to the others.
     pub fn new(theirs: &'a Cloud, mine: &'a Cloud, matches: &'a [Pairing], scene: &'a Scene, poses: &[Pose]) -> Self {
         let middle = theirs.points.iter().sum::<Vector3<f64>>() / theirs.points.len().max(1) as f64;
@@ -137,22 +137,22 @@ impl<'a> Court<'a> {
         promising.map(|pose| self.look(&pose, matches)).collect()
     }
 
-    /// The poses that look best at first glance, polished a little, best first.
+    /// The poses that look best at first coarse_score, polished a little, best first.
     fn promising(&self, poses: &[Pose]) -> Vec<Pose> {
-        let mut glanced: Vec<(f64, usize)> =
-            (0..poses.len()).map(|k| (self.glance(&poses[k], 0..GLANCED), k)).collect();
-        most(&mut glanced, GLANCED_AGAIN);
-        glanced.iter_mut().for_each(|(value, k)| *value += self.glance(&poses[*k], GLANCED..ROUGH));
-        most(&mut glanced, GLANCED_AGAIN);
+        let mut coarse: Vec<(f64, usize)> =
+            (0..poses.len()).map(|k| (self.coarse_score(&poses[k], 0..COARSE), k)).collect();
+        most(&mut coarse, GLANCED_AGAIN);
+        coarse.iter_mut().for_each(|(value, k)| *value += self.coarse_score(&poses[*k], COARSE..ROUGH));
+        most(&mut coarse, GLANCED_AGAIN);
         let mut distinct: Vec<Pose> = Vec::new();
-        for k in self.varied(poses, &glanced) {
+        for k in self.varied(poses, &coarse) {
             let pose = self.polish(poses[k], ROUGH, &RADII_ROUGH);
             if distinct.iter().all(|other| pose.differs(other, &self.middle, SAME.0, SAME.1)) {
                 distinct.push(pose);
             }
         }
         let mut distinct: Vec<(f64, Pose)> =
-            distinct.into_iter().map(|pose| (self.glance(&pose, 0..ROUGH), pose)).collect();
+            distinct.into_iter().map(|pose| (self.coarse_score(&pose, 0..ROUGH), pose)).collect();
         distinct.sort_by(|a, b| b.0.total_cmp(&a.0));
         distinct.into_iter().map(|(_, pose)| pose).collect()
     }
@@ -162,11 +162,11 @@ impl<'a> Court<'a> {
         self.close_look(self.polish(*pose, self.theirs.points.len(), &RADII), matches)
     }
 
-    /// The first [`POLISHED_MAX`] of those glanced at, but of poses near one of them only [`ALIKE_MAX`]: the rest of a good
+    /// The first [`POLISHED_MAX`] of those coarse at, but of poses near one of them only [`ALIKE_MAX`]: the rest of a good
     /// one's neighbourhood must not crowd out its rivals.
-    fn varied(&self, poses: &[Pose], glanced: &[(f64, usize)]) -> Vec<usize> {
+    fn varied(&self, poses: &[Pose], coarse: &[(f64, usize)]) -> Vec<usize> {
         let mut chosen: Vec<usize> = Vec::new();
-        for &(_, k) in glanced {
+        for &(_, k) in coarse {
             let alike = chosen.iter().filter(|&&c| !self.rivals(&poses[k], &poses[c])).count();
             if alike < ALIKE_MAX {
                 chosen.push(k);
@@ -189,12 +189,12 @@ impl<'a> Court<'a> {
     }
 
     /// Confirmed points of some, less contradicted ones.
-    fn glance(&self, pose: &Pose, some: Range<usize>) -> f64 {
+    fn coarse_score(&self, pose: &Pose, some: Range<usize>) -> f64 {
         let first = self.theirs.points.iter().zip(&self.theirs.normals).enumerate().take(some.end).skip(some.start);
         let count = self.chance.len() as f64;
         let value = |(k, (p, n)): (usize, (&Vector3<f64>, &Vector3<f64>))| match self
             .scene
-            .glance(&pose.apply(p), &(pose.rotation * n))
+            .coarse_score(&pose.apply(p), &(pose.rotation * n))
         {
             Verdict::Confirmed => 1.0 - f64::from(self.often[k]) / count,
             Verdict::Contradicted => -GLANCE_COST,
@@ -245,7 +245,7 @@ impl<'a> Court<'a> {
     }
 }
 
-impl Court<'_> {
+impl PoseVerifier<'_> {
     /// The best score of the surfaces if the pose is slid along the direction that fewest of them face, or turned about
     /// their middle: what may be done to it unpunished is not known. All of it where they face one way only.
     pub fn slid(&self, best: &Judged) -> f64 {

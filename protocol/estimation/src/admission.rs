@@ -3,15 +3,15 @@
 //! Facts come in any order and from anyone. Here they are sorted, repeats are set aside (one measurement counts once,
 //! DESIGN §8.10), and whatever names unknown submaps or holds invalid numbers is kept with its reason.
 
-use super::bend::Around;
 use super::distortion;
+use super::drift_model::DriftModel;
 use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
+use super::odometry_correlation::Around;
 use super::position::{DIMENSION, StatedPoint};
 use super::reweight::CHI2_999;
 use super::solve::SolveError;
 use super::trajectory::Trajectory;
-use super::walk::Walk;
 use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative, So3};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::kinds::PairStatus;
@@ -51,7 +51,7 @@ pub(super) struct Chain {
 }
 
 /// The admitted problem. An edge counts while its `unused` is `None`.
-pub(super) struct Intake {
+pub(super) struct Admission {
     pub(super) chains: BTreeMap<FrameId, Chain>,
     /// How many keyframes made each submap, where that is told.
     keyframes: BTreeMap<SubmapId, NonZero<u16>>,
@@ -60,7 +60,7 @@ pub(super) struct Intake {
     pub(super) edges: Vec<EdgeEstimate>,
 }
 
-impl Intake {
+impl Admission {
     pub(super) fn new(problem: &MapProblem) -> Self {
         let span = |frame: FrameId, place: usize| {
             let id = u32::try_from(place).ok().map(|index| SubmapId { frame, index });
@@ -74,7 +74,7 @@ impl Intake {
         let unknown_scale = unknown.map(|(&f, _)| f).collect();
         let ambiguous = problem.ambiguous.clone();
         let keyframes = problem.keyframes.clone();
-        let mut intake = Self { chains, keyframes, unknown_scale, ambiguous, edges: Vec::new() };
+        let mut admission = Self { chains, keyframes, unknown_scale, ambiguous, edges: Vec::new() };
         let alignments = sorted(&problem.alignments).into_iter().map(|m| (Kind::Alignment, m));
         let sightings = sorted(&problem.sightings).into_iter().map(|m| (Kind::Sighting, m));
         let tied = alignments.chain(sightings).map(|(kind, measurement)| EdgeEstimate::new(kind, measurement));
@@ -82,27 +82,27 @@ impl Intake {
         let (mut entries, mut submaps) = (BTreeSet::new(), BTreeMap::new());
         for edge in tied.chain(positions) {
             let EdgeEstimate { kind, measurement, .. } = edge;
-            let unused = intake.refusal(kind, &measurement, &mut entries, &mut submaps);
+            let unused = admission.refusal(kind, &measurement, &mut entries, &mut submaps);
             let stated = if kind == Kind::Alignment { problem.common.get(&measurement.entry) } else { None };
             let common = distortion::bounded(stated.copied().unwrap_or(0.0));
             let second_look = kind == Kind::Alignment && problem.second_looks.contains(&measurement.entry);
             let joins = kind == Kind::Alignment && !second_look;
-            intake.edges.push(EdgeEstimate { common, second_look, joins, unused, ..edge });
+            admission.edges.push(EdgeEstimate { common, second_look, joins, unused, ..edge });
         }
-        distortion::charge(&mut intake.edges);
-        for edge in intake.edges.iter_mut().filter(|edge| edge.second_look && edge.is_used()) {
+        distortion::charge(&mut admission.edges);
+        for edge in admission.edges.iter_mut().filter(|edge| edge.second_look && edge.is_used()) {
             edge.refuse(Unused::Waiting);
         }
-        for edge in &mut intake.edges {
+        for edge in &mut admission.edges {
             edge.weight = if edge.is_used() { edge.weight_at(1.0) } else { 0.0 };
         }
-        intake
+        admission
     }
 
     /// The odometry's walk while a submap was made.
-    pub(super) fn walk(&self, id: SubmapId) -> Option<Walk> {
+    pub(super) fn walk(&self, id: SubmapId) -> Option<DriftModel> {
         let whole = self.chains.get(&id.frame)?.walk(id.index as usize)?;
-        Some(Walk { whole, keyframes: self.keyframes.get(&id).copied() })
+        Some(DriftModel { whole, keyframes: self.keyframes.get(&id).copied() })
     }
 
     /// The odometry around an anchor.
@@ -115,12 +115,12 @@ impl Intake {
 
     /// The first and the last anchor of a frame and the walks while their submaps were made, as far as their neighbours'
     /// steps tell. Of a single step nobody knows whether it leads over a gap.
-    pub(super) fn ends(&self, frame: FrameId) -> Option<[(SubmapId, Walk); 2]> {
+    pub(super) fn ends(&self, frame: FrameId) -> Option<[(SubmapId, DriftModel); 2]> {
         let last = self.chains.get(&frame)?.len().checked_sub(1).filter(|&last| last > 1)?;
         let last = u32::try_from(last).ok()?;
         let of = |index: u32, neighbour: u32| {
             let [id, neighbour] = [index, neighbour].map(|index| SubmapId { frame, index });
-            Some((id, Walk { keyframes: self.keyframes.get(&id).copied(), ..self.walk(neighbour)? }))
+            Some((id, DriftModel { keyframes: self.keyframes.get(&id).copied(), ..self.walk(neighbour)? }))
         };
         Some([of(0, 1)?, of(last, last - 1)?])
     }

@@ -273,5 +273,5 @@ impl Half {
 }
 
 #[cfg(test)]
-#[path = "among_tests.rs"]
+#[path = "joint_covariance_tests.rs"]
 mod tests;

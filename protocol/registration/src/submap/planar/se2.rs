@@ -9,7 +9,7 @@ const IN_PLANE: [usize; 3] = [0, 1, 5];
 
 /// A motion of the plane: turns by an angle, then shifts.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Flat {
+pub struct Se2 {
     /// rad.
     pub angle: f64,
     /// Where the origin goes.
@@ -18,7 +18,7 @@ pub struct Flat {
     sin: f64,
 }
 
-impl Flat {
+impl Se2 {
     /// Turns by `angle` (rad) and goes to `at`.
     pub fn new(angle: f64, at: Vector2<f64>) -> Self {
         Self { angle, at, cos: cos(angle), sin: sin(angle) }
@@ -66,7 +66,7 @@ impl Flat {
         Self::new(wrapped(self.angle + step.z), self.apply(&step.xy()))
     }
 
-    /// (x, y, angle) of `other` in this pose's axes: what [`Flat::retract`] takes, to first order.
+    /// (x, y, angle) of `other` in this pose's axes: what [`Se2::retract`] takes, to first order.
     pub fn local(&self, other: &Self) -> Vector3<f64> {
         let moved = self.turn_back(&(other.at - self.at));
         Vector3::new(moved.x, moved.y, wrapped(other.angle - self.angle))
@@ -85,7 +85,7 @@ pub fn wrapped(angle: f64) -> f64 {
 
 /// The pose in space with a covariance in the plane (x, y, angle of the local perturbation) and, of the rest, the
 /// standard deviations (height, tilt), both in the units of `unit` and rad.
-pub fn in_space(pose: &Flat, unit: f64, covariance: &Matrix3<f64>, (height, tilt): (f64, f64)) -> PoseWithCovariance {
+pub fn in_space(pose: &Se2, unit: f64, covariance: &Matrix3<f64>, (height, tilt): (f64, f64)) -> PoseWithCovariance {
     let mut m = Matrix6::zeros();
     let scale = |k: usize| if k < 2 { unit } else { 1.0 };
     for (r, &row) in IN_PLANE.iter().enumerate() {

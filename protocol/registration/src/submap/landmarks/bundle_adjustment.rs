@@ -34,7 +34,7 @@ const OWN_KEPT: f64 = 0.5;
 
 /// Landmarks in the anchor frame, those of most sightings first. `motions[k]` leads from keyframe k to the next, `start`
 /// is `t_anchor_body` of each by the motions alone, and `anchor` is the one that stays.
-pub fn settle(seen: &[Seen], motions: &[PoseWithCovariance], start: &[Se3], anchor: usize) -> Constellation {
+pub fn adjust(seen: &[Seen], motions: &[PoseWithCovariance], start: &[Se3], anchor: usize) -> Constellation {
     let mut problem = Problem::new(seen, motions, start, anchor);
     problem.screen();
     for round in 0..ROUNDS {

@@ -24,7 +24,7 @@ const STRIDES_MAX: usize = 4096;
 const GUARD: i32 = 1;
 
 /// The raster.
-pub struct Chart {
+pub struct Codec {
     low: Vector2<f64>,
     /// Cells along x and y.
     pub size: [i32; 2],
@@ -54,12 +54,12 @@ impl Beam {
 
 /// For each of the points how many beams passed through its cell.
 pub fn passed(points: &[Vector2<f64>], beams: &[Beam]) -> Vec<u8> {
-    let chart = Chart::blank(points);
+    let chart = Codec::blank(points);
     let passed = chart.passed(beams);
     points.iter().map(|p| chart.position(chart.cell(p)).map_or(0, |at| passed[at])).collect()
 }
 
-impl Chart {
+impl Codec {
     /// Of oriented points; `all` are those and the ones without orientation. Cells are free through which at least
     /// `beams_min` beams passed.
     pub fn new(walls: &Walls, all: &[Vector2<f64>], beams: &[Beam], beams_min: u8) -> Self {

@@ -3,9 +3,9 @@
 //! this pair confirms, too, such as one on the long wall of a corridor, weighs nothing; a door frame weighs much.
 
 use super::super::near::Near;
-use super::chart::Chart;
+use super::codec::Codec;
 use super::fit::{Walls, counterpart, system};
-use super::flat::Flat;
+use super::se2::Se2;
 use nalgebra::{Matrix3, Vector2};
 
 /// A keypoint lies on my wall if a point of mine is this near...
@@ -36,7 +36,7 @@ const PAIRS_MIN: usize = 10;
 /// A polished pose and what my submap says of it.
 pub struct Judged {
     /// `t_mine_theirs`.
-    pub pose: Flat,
+    pub pose: Se2,
     confirmed: Vec<bool>,
     /// Keypoints on my walls...
     pub hits: usize,
@@ -59,24 +59,24 @@ impl Judged {
 }
 
 /// All that is needed to judge poses of one pair.
-pub struct Court<'a> {
+pub struct PoseVerifier<'a> {
     /// Their keypoints...
     pub theirs: &'a Walls,
     /// ...the middle of them...
     pub middle: Vector2<f64>,
     /// ...and what their beams passed through.
-    pub their_chart: &'a Chart,
+    pub their_chart: &'a Codec,
     /// My walls...
     pub near: &'a Near,
     /// ...about as many points of them as they have keypoints...
     pub mine: &'a [Vector2<f64>],
     /// ...and what my beams passed through.
-    pub chart: &'a Chart,
+    pub chart: &'a Codec,
 }
 
-impl Court<'_> {
+impl PoseVerifier<'_> {
     /// The poses, polished and judged by one another, best first.
-    pub fn judge(&self, poses: &[Flat]) -> Vec<Judged> {
+    pub fn judge(&self, poses: &[Se2]) -> Vec<Judged> {
         let mut judged: Vec<Judged> = Vec::new();
         for pose in poses {
             let pose = self.polished(*pose);
@@ -91,11 +91,11 @@ impl Court<'_> {
     }
 
     /// Whether at most one of two poses is right.
-    pub fn rivals(&self, a: &Flat, b: &Flat) -> bool {
+    pub fn rivals(&self, a: &Se2, b: &Se2) -> bool {
         a.differs(b, &self.middle, RIVAL.0, RIVAL.1)
     }
 
-    fn polished(&self, mut pose: Flat) -> Flat {
+    fn polished(&self, mut pose: Se2) -> Se2 {
         for radius in RADII {
             let system = system(self.theirs, self.near, &pose, radius, ALIKE);
             if system.pairs < PAIRS_MIN {
@@ -109,7 +109,7 @@ impl Court<'_> {
         pose
     }
 
-    fn look(&self, pose: Flat) -> Judged {
+    fn look(&self, pose: Se2) -> Judged {
         let mut judged = Judged { pose, confirmed: Vec::new(), hits: 0, contradicted: 0, score: 0.0 };
         for (p, n) in self.theirs.points.iter().zip(&self.theirs.normals) {
             let (at, facing) = (pose.apply(p), pose.turn(n));

@@ -14,13 +14,13 @@
 //! shelves without end every 5 m 77 of 77, every 8 m 75 of 79; rooms of 8 m, of which one hardly sees the next, 62 of 76.
 //! True pairs: halls 0 of 59, 7-Scenes 0 of 84, KITTI 07 0 of 19.
 
-use super::court::{Court, Judged};
 use super::features::Features;
 use super::gravity::Upright;
 use super::hypotheses::hypotheses;
 use super::matching::Pairings;
 use super::scene::{Cloud, Pose};
-use super::shifts;
+use super::translation_voting;
+use super::verifier::{Judged, PoseVerifier};
 use nalgebra::Vector3;
 
 /// Pairs of matches with what lies elsewhere that are tried as poses at most.
@@ -47,7 +47,7 @@ pub(super) fn rival(
     pairings: &Pairings,
     (mine, my_points): (&Features, &[Vector3<f64>]),
     (their_cloud, my_cloud): (&Cloud, &Cloud),
-    court: &Court<'_>,
+    verifier: &PoseVerifier<'_>,
     best: &Judged,
     upright: &Upright,
 ) -> Option<Judged> {
@@ -55,9 +55,9 @@ pub(super) fn rival(
     let is_there =
         |their: usize, my: usize| (placed[their] - my_cloud.points[my]).norm_squared() <= ELSEWHERE * ELSEWHERE;
     let elsewhere = pairings.except(mine, my_points, is_there);
-    let is_apart = |pose: &Pose| court.differ(pose, &best.pose, APART, TURNED);
+    let is_apart = |pose: &Pose| verifier.differ(pose, &best.pose, APART, TURNED);
     let mut poses = hypotheses(their_cloud, my_cloud, &elsewhere, TRIES_MAX);
-    poses.extend(shifts::shifts((&placed, &best.pose), their_cloud, my_cloud, upright.up(), APART));
+    poses.extend(translation_voting::shifts((&placed, &best.pose), their_cloud, my_cloud, upright.up(), APART));
     poses.retain(|pose| is_apart(pose) && upright.allows_rough(pose));
     let stands = |rival: &Judged| {
         is_apart(&rival.pose)
@@ -65,9 +65,9 @@ pub(super) fn rival(
             && rival.contradiction() <= CONTRADICTION_MAX
             && rival.support.len() >= SUPPORT_MIN
             && rival.confirmed() as f64 >= CONFIRMED_MIN * best.confirmed() as f64
-            && faces_all_ways(court.least_facing(rival), rival.support.len())
+            && faces_all_ways(verifier.least_facing(rival), rival.support.len())
     };
-    let judged = court.judge_with(&elsewhere, &poses, is_apart);
+    let judged = verifier.judge_with(&elsewhere, &poses, is_apart);
     judged.into_iter().filter(stands).max_by_key(|rival| rival.support.len())
 }
 

@@ -15,7 +15,7 @@ use core::num::NonZero;
 
 /// The walk of the odometry while a submap was made.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Walk {
+pub(super) struct DriftModel {
     /// From anchor to anchor.
     pub(super) whole: Covariance<6>,
     /// How many keyframes made the submap, if that was told.
@@ -31,7 +31,7 @@ pub(super) struct Stretch {
     pub(super) follows: f64,
 }
 
-impl Walk {
+impl DriftModel {
     /// Where the cloud lies by its anchor. `None` for a single keyframe: there it is.
     pub(super) fn off_anchor(&self) -> Option<Covariance<6>> {
         self.share(1.0 / 12.0, |n, [b, a]| (squares(b) + squares(a)) / (n * n * n))
@@ -75,8 +75,8 @@ mod tests {
     use super::*;
     use crate::test_graphs::sigmas;
 
-    fn walk(keyframes: Option<u16>) -> Walk {
-        Walk { whole: sigmas(1.0, 1.0), keyframes: keyframes.and_then(NonZero::new) }
+    fn walk(keyframes: Option<u16>) -> DriftModel {
+        DriftModel { whole: sigmas(1.0, 1.0), keyframes: keyframes.and_then(NonZero::new) }
     }
 
     /// Shares of the variance: off the anchor; of either side, what is lost there and how that goes with the first.
