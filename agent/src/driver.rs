@@ -191,7 +191,8 @@ impl<C: Core, N: Network> Driver<C, N> {
         (Self { parts, workers, views, journal_flushed: Instant::ZERO, inputs: 0 }, Snapshots(sender))
     }
 
-    /// Runs until `stop` comes, then closes the open submap. All batches handed to the store are on disk when it returns.
+    /// Runs until `stop` comes, then closes the open submap. All batches handed to the store are on disk when it
+    /// returns.
     pub async fn run(mut self, stop: impl Future<Output = ()>) -> Finished {
         let mut stop = std::pin::pin!(stop);
         let mut after_timeout = false;

@@ -1,9 +1,9 @@
 //! A journal of everything that happened to an agent: with it, and the same key, the core can be run again to the bit,
 //! so that a bug seen in the field becomes a test.
 //!
-//! A file is a sequence of frames, each a little-endian `u32` length and a postcard [`Frame`]: first the [`Start`], then
-//! every input with its moment, at the end the digest that the live run came to. Results of jobs are not written: a job
-//! is a pure function of its data, so the replay runs it again. A frame that a crash cut short ends the journal.
+//! A file is a sequence of frames, each a little-endian `u32` length and a postcard [`Frame`]: first the [`Start`],
+//! then every input with its moment, at the end the digest that the live run came to. Results of jobs are not written:
+//! a job is a pure function of its data, so the replay runs it again. A frame that a crash cut short ends the journal.
 
 use crate::observation::{KeyframeMessage, ObservationError};
 use merganser_protocol::agent::io::{
@@ -22,7 +22,8 @@ use thiserror::Error;
 
 /// Version of the format.
 const VERSION: u32 = 5;
-/// Largest frame read, in bytes: a keyframe of [`crate::observation::POINTS_MAX`] points is 4.8 MB, a restored store may be more.
+/// Largest frame read, in bytes: a keyframe of [`crate::observation::POINTS_MAX`] points is 4.8 MB, a restored store
+/// may be more.
 const FRAME_LEN_MAX: u32 = 1 << 30;
 
 /// What an agent began with.

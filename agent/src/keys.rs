@@ -1,9 +1,10 @@
-//! The keys of DESIGN §5: where on Zenoh each message of each robot travels, with which encoding and quality of service.
+//! The keys of DESIGN §5: where on Zenoh each message of each robot travels, with which encoding and quality of
+//! service.
 //!
 //! `merganser/v1/{swarm}/{robot}/…`: a changed wire version is a different key, so incompatible versions never meet.
-//! Congestion control is always `Drop`: with `Block` one stalled neighbour would close the session after 5 s. On TCP all
-//! messages are reliable once sent; "best effort" means that they may be dropped before (Zenoh's reliability hint is an
-//! unstable interface in 1.10 and changes nothing on TCP).
+//! Congestion control is always `Drop`: with `Block` one stalled neighbour would close the session after 5 s. On TCP
+//! all messages are reliable once sent; "best effort" means that they may be dropped before (Zenoh's reliability hint
+//! is an unstable interface in 1.10 and changes nothing on TCP).
 
 use merganser_protocol::agent::io::{Channel, QueryKind};
 use merganser_protocol::ids::Name;

@@ -77,8 +77,8 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Starts the thread. `done` hears [`Input::Persisted`] after each commit, and [`Input::PersistFailed`] when a commit
-    /// fails that did not fail before.
+    /// Starts the thread. `done` hears [`Input::Persisted`] after each commit, and [`Input::PersistFailed`] when a
+    /// commit fails that did not fail before.
     ///
     /// # Errors
     /// If the system gives no thread.
@@ -107,8 +107,8 @@ impl Drop for Writer {
     }
 }
 
-/// Seconds since 2020; a clock that stands before, or beyond 2156, gives 0 (the core then counts on from what peers know of
-/// it).
+/// Seconds since 2020; a clock that stands before, or beyond 2156, gives 0 (the core then counts on from what peers
+/// know of it).
 pub fn fresh_epoch(now: SystemTime) -> u32 {
     let secs = now.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
     u32::try_from(secs.saturating_sub(EPOCH_ORIGIN_SECS)).unwrap_or(0)

@@ -244,7 +244,8 @@ async fn views_are_published_as_json_while_somebody_subscribes() {
     alpha.stop().await.unwrap();
 }
 
-/// Found in review: at its last epoch an agent is receive-only, but what it has of the epoch before can still be written.
+/// Found in review: at its last epoch an agent is receive-only, but what it has of the epoch before can still be
+/// written.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_at_its_last_epoch_still_saves_what_it_drove_before_it_ends() {
     let dir = tempfile::tempdir().unwrap();

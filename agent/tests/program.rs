@@ -1,4 +1,5 @@
-//! The program itself: `run` with a recording and a journal, ended by SIGTERM; `replay` of what it wrote; `watch` beside it.
+//! The program itself: `run` with a recording and a journal, ended by SIGTERM; `replay` of what it wrote; `watch`
+//! beside it.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod common;

@@ -13,8 +13,8 @@
 //! bug. `tests/agents/contract.rs` holds the core to all of this.
 //!
 //! What this crate builds on has crates of its own, so that the compiler keeps the arrows: `types` and `geometry` ←
-//! `registration` ([`align`], [`submap`]) and `estimation` ([`estimate`]) ← this crate, whose modules point one way, too:
-//! [`wire`], [`snapshot`] ← [`replica`] ← [`gossip`] ← [`agent`].
+//! `registration` ([`align`], [`submap`]) and `estimation` ([`estimate`]) ← this crate, whose modules point one way,
+//! too: [`wire`], [`snapshot`] ← [`replica`] ← [`gossip`] ← [`agent`].
 
 pub mod agent;
 pub mod gossip;

@@ -77,8 +77,8 @@ pub struct StatusView {
     pub idle: bool,
     /// Names of robots of which at least one frame is merged with this robot's present frame.
     pub merged_with: Vec<String>,
-    /// Nothing new of our own is begun. The store fails, and nothing received counts until it works again; or this robot
-    /// began more epochs than the others take. Its log says which.
+    /// Nothing new of our own is begun. The store fails, and nothing received counts until it works again; or this
+    /// robot began more epochs than the others take. Its log says which.
     pub receive_only: bool,
 }
 
@@ -147,8 +147,8 @@ pub struct RobotPairView {
     pub a: String,
     /// Name of the second.
     pub b: String,
-    /// `t_a_b` of their bodies at their [`RobotView::stamp_secs`]. The covariance knows what the two have in common, so it
-    /// is smaller than that of two [`RobotView::t_own_body`] taken as independent.
+    /// `t_a_b` of their bodies at their [`RobotView::stamp_secs`]. The covariance knows what the two have in common, so
+    /// it is smaller than that of two [`RobotView::t_own_body`] taken as independent.
     pub t_a_b: RelationView,
 }
 
@@ -258,8 +258,8 @@ pub struct StatsView {
     pub rejected_by_peer: BTreeMap<String, u64>,
     /// Alignments tried here, found, refused, agreed, disputed; solves.
     pub work: BTreeMap<String, u64>,
-    /// What `gossip.link_bytes_per_sec` held back, by class: new entries that waited, answers put off, turns to announce
-    /// or ask that waited.
+    /// What `gossip.link_bytes_per_sec` held back, by class: new entries that waited, answers put off, turns to
+    /// announce or ask that waited.
     #[serde(default)]
     pub held_back: BTreeMap<String, u64>,
     /// Bytes of this robot's logs that were condensed, before and after, summed over every time.

@@ -1,7 +1,7 @@
-//! Hostile bytes, on every test run: the corpus that fuzzing found, replayed, and some thousands of random stories more.
-//! An allocation over [`fuzzing::ALLOCATION_MAX`] fails, as does any panic. One input alone:
-//! `MERGANSER_FUZZ=handle:path/to/file cargo test -p merganser-protocol --release --test fuzz_corpus`, and random ones of
-//! another seed: `MERGANSER_FUZZ_SEED=7 …`.
+//! Hostile bytes, on every test run: the corpus that fuzzing found, replayed, and some thousands of random stories
+//! more. An allocation over [`fuzzing::ALLOCATION_MAX`] fails, as does any panic. One input alone:
+//! `MERGANSER_FUZZ=handle:path/to/file cargo test -p merganser-protocol --release --test fuzz_corpus`, and random ones
+//! of another seed: `MERGANSER_FUZZ_SEED=7 …`.
 #![allow(
     missing_docs,
     clippy::unwrap_used,

@@ -8,8 +8,8 @@ use std::sync::{Mutex, PoisonError, mpsc};
 pub struct Band(pub u64, pub u64);
 
 impl Band {
-    /// Does `work` for every seed, `jobs` of them at once, and `tell`s of each in their order, as soon as all before it are
-    /// done. A job whose work gives nothing begins no other.
+    /// Does `work` for every seed, `jobs` of them at once, and `tell`s of each in their order, as soon as all before it
+    /// are done. A job whose work gives nothing begins no other.
     pub fn for_each<T: Send>(self, jobs: usize, work: impl Fn(u64) -> Option<T> + Sync, mut tell: impl FnMut(u64, T)) {
         let seeds = Mutex::new(self.0..self.1);
         let next = || seeds.lock().unwrap_or_else(PoisonError::into_inner).next();

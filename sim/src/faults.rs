@@ -1,5 +1,5 @@
-//! The fault schedule: what happens to links, processes and disks, and when. Faults on messages (loss, delay…) are drawn
-//! per message by the network; these are the ones with a beginning and an end.
+//! The fault schedule: what happens to links, processes and disks, and when. Faults on messages (loss, delay…) are
+//! drawn per message by the network; these are the ones with a beginning and an end.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

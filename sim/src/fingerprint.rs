@@ -1,9 +1,9 @@
-//! `merganser-sim fingerprint`: what scenarios come to, to the bit. A change that must not change what robots decide leaves
-//! every line as it was; one that must shows which lines it moved.
+//! `merganser-sim fingerprint`: what scenarios come to, to the bit. A change that must not change what robots decide
+//! leaves every line as it was; one that must shows which lines it moved.
 //!
-//! A line names a scenario, its seed, the trace (BLAKE3 over every input and output of every robot), and the map: BLAKE3
-//! over every number of the joint estimates that the robots hold at the end. The first seed of `three` is the drives that
-//! the demo's recordings are made from, so its map is the demo's.
+//! A line names a scenario, its seed, the trace (BLAKE3 over every input and output of every robot), and the map:
+//! BLAKE3 over every number of the joint estimates that the robots hold at the end. The first seed of `three` is the
+//! drives that the demo's recordings are made from, so its map is the demo's.
 
 use crate::band::{Band, jobs};
 use crate::bar::progress_bar;

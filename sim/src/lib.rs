@@ -1,8 +1,10 @@
 //! The Merganser core on a virtual network, in virtual time: a generated world that robots drive through, links that
-//! lose, delay, double and block messages, disks and processes that fail, and invariants that are checked all the while.
+//! lose, delay, double and block messages, disks and processes that fail, and invariants that are checked all the
+//! while.
 //!
-//! A run is a pure function of a [`scenario::Scenario`] and a seed: the same pair gives the same trace hash, bit for bit.
-//! First a storm (robots drive, faults rage), then calm: the network heals and the swarm must converge in a stated time.
+//! A run is a pure function of a [`scenario::Scenario`] and a seed: the same pair gives the same trace hash, bit for
+//! bit. First a storm (robots drive, faults rage), then calm: the network heals and the swarm must converge in a stated
+//! time.
 
 pub mod band;
 pub mod bar;

@@ -59,8 +59,8 @@ pub struct Recorded {
     pub secs: f64,
 }
 
-/// Writes one folder per robot of the scenario into `out`; robots drive `along` a recorded drive, if there is one. Tells
-/// `progress` how many of how many keyframes are done.
+/// Writes one folder per robot of the scenario into `out`; robots drive `along` a recorded drive, if there is one.
+/// Tells `progress` how many of how many keyframes are done.
 ///
 /// # Errors
 /// [`RecordError`]; what was written before stays.

@@ -33,7 +33,8 @@ pub struct Report {
     pub robots: Vec<RobotReport>,
     /// Each robot's error about each other frame that it merged.
     pub frame_errors: Vec<FrameError>,
-    /// Mean of `d2` over `frame_errors`; about 6 for honest covariances, 7 where units are unknown. `None` without merged frames.
+    /// Mean of `d2` over `frame_errors`; about 6 for honest covariances, 7 where units are unknown. `None` without
+    /// merged frames.
     pub mean_d2: Option<f64>,
     /// Messages by kind, for each robot of the scenario.
     pub sent: BTreeMap<String, BTreeMap<&'static str, Usage>>,

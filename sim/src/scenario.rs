@@ -104,7 +104,8 @@ pub struct SummaryOptions {
     pub reach_m: f64,
     /// Standard deviation of an alignment, m and rad.
     pub sigma: [f64; 2],
-    /// Share of an alignment's variance that all alignments of the one submap have in common, and of the other: 0 to 0.5.
+    /// Share of an alignment's variance that all alignments of the one submap have in common, and of the other: 0 to
+    /// 0.5.
     pub common: f64,
     /// Share of the pairs that align which are refused at first sight, and found with further keypoints.
     pub refused_at_first: f64,

@@ -132,8 +132,8 @@ impl Stage {
         self.places.as_ref()?.look(&at, &mut dice).ok()
     }
 
-    /// What one keyframe takes for up, if an inertial sensor tells: off by what all of the robot's have in common, and by a draw
-    /// of its own.
+    /// What one keyframe takes for up, if an inertial sensor tells: off by what all of the robot's have in common, and
+    /// by a draw of its own.
     pub fn up(&self, robot: usize, index: usize) -> Option<Up> {
         let sigma = self.gravity_sigma?;
         let draw = |label: String| {

@@ -1,5 +1,5 @@
-//! How far the swarm's beliefs are from the truth: each robot's merged frames against where those frames really lie, and
-//! what one is in them.
+//! How far the swarm's beliefs are from the truth: each robot's merged frames against where those frames really lie,
+//! and what one is in them.
 
 use crate::check::{RobotSample, Sample};
 use merganser_protocol::geometry::{Covariance, Se3, Sim3, So3};

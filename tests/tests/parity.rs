@@ -1,5 +1,5 @@
-//! Real cores on real Zenoh: two robots come to the same set of facts, a restart goes on from disk where it ended, and the
-//! journal of a live run, replayed into a core alone, gives the same digest and the same estimate.
+//! Real cores on real Zenoh: two robots come to the same set of facts, a restart goes on from disk where it ended, and
+//! the journal of a live run, replayed into a core alone, gives the same digest and the same estimate.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 #[path = "../../agent/tests/common/mod.rs"]

@@ -1,8 +1,9 @@
-//! Logs of the CARMEN toolkit, as the Radish data sets come: a message a line, of which `FLASER` (a planar scan with the
-//! wheels' odometry) and the parameter `robot_frontlaser_offset` are used. Pure text: the caller reads the file.
+//! Logs of the CARMEN toolkit, as the Radish data sets come: a message a line, of which `FLASER` (a planar scan with
+//! the wheels' odometry) and the parameter `robot_frontlaser_offset` are used. Pure text: the caller reads the file.
 //!
-//! `FLASER n r₁ … rₙ x y θ odom_x odom_y odom_θ ipc_timestamp host logger_timestamp`: ranges in m from right to left over
-//! 180°, poses in m and rad. What lies beyond [`RANGE_M`] is left out, and with it readings that stand for no return.
+//! `FLASER n r₁ … rₙ x y θ odom_x odom_y odom_θ ipc_timestamp host logger_timestamp`: ranges in m from right to left
+//! over 180°, poses in m and rad. What lies beyond [`RANGE_M`] is left out, and with it readings that stand for no
+//! return.
 
 use crate::line_error::LineError;
 use core::f64::consts::PI;

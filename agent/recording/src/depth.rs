@@ -1,6 +1,6 @@
-//! Depth images, and the pinhole cameras that take them: what a live keyframe and a folder of images have in common. The
-//! camera looks along z, x is right and y is down; a pixel (u, v) of depth z lies at ((u − cx) z / fx, (v − cy) z / fy, z).
-//! Images are rectified: a fish eye's distortion is to be taken out before.
+//! Depth images, and the pinhole cameras that take them: what a live keyframe and a folder of images have in common.
+//! The camera looks along z, x is right and y is down; a pixel (u, v) of depth z lies at ((u − cx) z / fx, (v − cy) z /
+//! fy, z). Images are rectified: a fish eye's distortion is to be taken out before.
 
 use std::io::Cursor;
 use std::ops::RangeInclusive;

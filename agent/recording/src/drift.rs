@@ -19,9 +19,9 @@ pub struct Drift {
 }
 
 impl Drift {
-    /// Odometry of `truth` (`t_world_body` of each keyframe) in a frame that begins at the first body pose: `t_frame_body`
-    /// with the covariance of the motion since the previous keyframe. The first keyframe states that of a step of no
-    /// length.
+    /// Odometry of `truth` (`t_world_body` of each keyframe) in a frame that begins at the first body pose:
+    /// `t_frame_body` with the covariance of the motion since the previous keyframe. The first keyframe states that of
+    /// a step of no length.
     ///
     /// # Errors
     /// [`CovarianceError`] if a step's covariance is out of range (no drift at all, or a step of many kilometres).

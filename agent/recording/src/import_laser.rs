@@ -1,5 +1,5 @@
-//! A CARMEN log (`*.clf`, or packed `*.clf.bz2`) becomes three planar robots with its real odometry. Each drives a stretch
-//! of the way, the stretches overlap, and each is given every third scan: two robots never hold the same one.
+//! A CARMEN log (`*.clf`, or packed `*.clf.bz2`) becomes three planar robots with its real odometry. Each drives a
+//! stretch of the way, the stretches overlap, and each is given every third scan: two robots never hold the same one.
 
 use super::Writer;
 use super::cloud::read_bytes;

@@ -1,5 +1,5 @@
-//! An MRCLAM data set becomes its robots: `RobotN_Odometry.dat` and `RobotN_Measurement.dat` of each, `Barcodes.dat` of all
-//! (each may be packed, `.xz`). A filter stands in for each robot's own SLAM (`crate::mrclam`); landmarks are
+//! An MRCLAM data set becomes its robots: `RobotN_Odometry.dat` and `RobotN_Measurement.dat` of each, `Barcodes.dat` of
+//! all (each may be packed, `.xz`). A filter stands in for each robot's own SLAM (`crate::mrclam`); landmarks are
 //! handed over under their bar codes, and where other robots were seen.
 
 use super::Writer;
@@ -178,7 +178,8 @@ mod tests {
         let keyframe = recordings[0].keyframe(5).unwrap();
         assert!(!keyframe.marks.is_empty() && keyframe.marks.len() == keyframe.points.len());
         assert!(keyframe.marks.iter().all(|mark| matches!(mark.label, Some(72 | 27))), "landmarks only, no robots");
-        // The first sees the second, 3 m ahead and a little to the left; the second sees its own code, which is misread.
+        // The first sees the second, 3 m ahead and a little to the left; the second sees its own code, which is
+        // misread.
         let [met, none] = [0, 1].map(|k| recordings[k].positions());
         assert_eq!((met.len(), none.len()), (100, 0));
         assert!(met.iter().all(|seen| seen.robot.as_str() == "robot2"));

@@ -53,9 +53,9 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
     scans.sort_by_key(|scan| scan.stamp);
     let mut config = Config::default();
     config.submap.voxel_m = 0.05;
-    // A narrow view leans on few surfaces: of ten images they are more than of five. Measured over three drifts (seed 1 in
-    // brackets): frames 0.018 m and 0.74° off (0.019 m and 0.78° at worst) with ten, 0.022 m and 0.79° (0.029 m and 0.63°)
-    // with five, and no better with three times as many keypoints.
+    // A narrow view leans on few surfaces: of ten images they are more than of five. Measured over three drifts (seed 1
+    // in brackets): frames 0.018 m and 0.74° off (0.019 m and 0.78° at worst) with ten, 0.022 m and 0.79° (0.029 m and
+    // 0.63°) with five, and no better with three times as many keypoints.
     config.submap.keyframes_max = 10;
     let origin = format!("7-Scenes RGB-D, {} depth images cut into three robots by thirds", scans.len());
     let cut = Cut { robots: 3, sensor: "depth", origin, drift: DRIFT, seed, config };

@@ -1,5 +1,5 @@
-//! Folders of depth images, of LiDAR scans and of a planar laser's log: good ones become robots, of bad ones the file, the
-//! line and the remedy are told.
+//! Folders of depth images, of LiDAR scans and of a planar laser's log: good ones become robots, of bad ones the file,
+//! the line and the remedy are told.
 
 use super::Recording;
 use super::error::RecordingError;

@@ -1,6 +1,6 @@
-//! Landmarks in clouds: a PLY whose vertices have, besides x, y, z, the properties `cxx cxy cxz cyy cyz czz` (the covariance
-//! of the place, body frame, m²), and may have `label` (any integer type; negative for none) and `d0` to `d31` (uchar: 256
-//! bits; all zero for none).
+//! Landmarks in clouds: a PLY whose vertices have, besides x, y, z, the properties `cxx cxy cxz cyy cyz czz` (the
+//! covariance of the place, body frame, m²), and may have `label` (any integer type; negative for none) and `d0` to
+//! `d31` (uchar: 256 bits; all zero for none).
 
 use super::cloud::{Fault, read_bytes};
 use super::error::{Problem, RecordingError};

@@ -6,15 +6,18 @@
 //! - `keyframes.csv`: a header line ([`KEYFRAMES_HEADER`]), then one line per keyframe with rising stamps:
 //!   `stamp_ns,x,y,z,qx,qy,qz,qw,c00,c01,…,c55,cloud` (21 numbers of the covariance's upper triangle, tangent order
 //!   (ρ, φ), local perturbation).
-//! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, m, one per keyframe.
-//! - `places.f32` (if the manifest has `[places]`): what the user's own place recognition says of each keyframe, a row of
-//!   little-endian f32 each, as `numpy.ndarray.tofile` writes them; a row of NaN where there is nothing to say.
-//! - `positions.csv` (optional): a header line ([`POSITIONS_HEADER`]), then with stamps that do not fall where other robots
-//!   were seen: `stamp_ns,robot,x,y,z,c00,c01,c02,c11,c12,c22` (the body's origin in the observer's body frame, m, and the
-//!   upper triangle of its covariance). Only robots whose recordings state `begins_ns` can be played so that they meet.
-//! - `up.csv` (optional): a header line ([`UP_HEADER`]), then `stamp_ns,x,y,z,sigma_rad` for each keyframe that knows the
-//!   direction against gravity in the body frame (length 1) and its standard deviation about each horizontal axis. Where
-//!   the SLAM's frame has its z axis upwards, `config.submap.gravity = "frame_z"` in the manifest says so for all.
+//! - `truth.csv` (optional): a header line, then `stamp_ns,x,y,z,qx,qy,qz,qw` of the body in the world, m, one per
+//!   keyframe.
+//! - `places.f32` (if the manifest has `[places]`): what the user's own place recognition says of each keyframe, a row
+//!   of little-endian f32 each, as `numpy.ndarray.tofile` writes them; a row of NaN where there is nothing to say.
+//! - `positions.csv` (optional): a header line ([`POSITIONS_HEADER`]), then with stamps that do not fall where other
+//!   robots were seen: `stamp_ns,robot,x,y,z,c00,c01,c02,c11,c12,c22` (the body's origin in the observer's body frame,
+//!   m, and the upper triangle of its covariance). Only robots whose recordings state `begins_ns` can be played so that
+//!   they meet.
+//! - `up.csv` (optional): a header line ([`UP_HEADER`]), then `stamp_ns,x,y,z,sigma_rad` for each keyframe that knows
+//!   the direction against gravity in the body frame (length 1) and its standard deviation about each horizontal axis.
+//!   Where the SLAM's frame has its z axis upwards, `config.submap.gravity = "frame_z"` in the manifest says so for
+//!   all.
 //! - the clouds that the keyframes name, relative to the folder, points in the body frame.
 //!
 //! A data set for several robots is a folder whose sub-folders are recordings.
@@ -60,11 +63,12 @@ pub struct Manifest {
     /// Where the data came from and what was laid on it (drift, cuts), for people.
     #[serde(default)]
     pub origin: String,
-    /// What one is in poses and points, m, where `config.submap.scale = "unknown"` and it is known all the same. The map
-    /// is judged by it; no agent is told. In [`UNIT_RANGE_M`].
+    /// What one is in poses and points, m, where `config.submap.scale = "unknown"` and it is known all the same. The
+    /// map is judged by it; no agent is told. In [`UNIT_RANGE_M`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit_m: Option<f64>,
-    /// What this robot's clock showed when all recordings of the data set began; without it, when its first keyframe came.
+    /// What this robot's clock showed when all recordings of the data set began; without it, when its first keyframe
+    /// came.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub begins_ns: Option<i64>,
     /// What the rows of `places.f32` are, if there is one.

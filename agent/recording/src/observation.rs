@@ -1,6 +1,6 @@
-//! What a robot's own SLAM sends to its agent, as it travels: a keyframe, a sighting or a position, in JSON or postcard,
-//! told by the sample's encoding. Decoding is strict (the whole input, known fields only, bounded, finite, positive definite) and
-//! gives domain values, or one clear error.
+//! What a robot's own SLAM sends to its agent, as it travels: a keyframe, a sighting or a position, in JSON or
+//! postcard, told by the sample's encoding. Decoding is strict (the whole input, known fields only, bounded, finite,
+//! positive definite) and gives domain values, or one clear error.
 //!
 //! ```json
 //! {"stamp_ns": 1700000000000000000, "translation": [0, 0, 0], "rotation": [0, 0, 0, 1],
@@ -8,28 +8,28 @@
 //!  "covariance_of": "motion", "points": [[1.5, 0.2, 0.0]]}
 //! ```
 //!
-//! Where points are landmarks (`submap.sensor = "landmarks"` or `"landmarks_2d"`), `landmarks` says of each point what else
-//! is known, in the points' order: the upper triangle of its covariance, row by row, and a label or a descriptor of 256 bits
-//! (32 bytes) or both. A message without `landmarks` (in postcard: one that ends with its points) has none.
+//! Where points are landmarks (`submap.sensor = "landmarks"` or `"landmarks_2d"`), `landmarks` says of each point what
+//! else is known, in the points' order: the upper triangle of its covariance, row by row, and a label or a descriptor
+//! of 256 bits (32 bytes) or both. A message without `landmarks` (in postcard: one that ends with its points) has none.
 //!
 //! ```text
 //! "points": [[1.5, 0.2, 0.0]], "landmarks": [{"covariance": [1e-3, 0, 0, 1e-3, 0, 1e-3], "label": 72}]
 //! ```
 //!
-//! `place` is what your own place recognition (NetVLAD and the like) says of the keyframe: a vector of 2 to 16,384 numbers,
-//! how two are compared (`"cosine"` or `"euclidean"`), and a name for what made it, for only vectors of one model are
-//! compared. Submaps that have one are proposed for alignment by it. A message may do without (in postcard: end with its
-//! landmarks).
+//! `place` is what your own place recognition (NetVLAD and the like) says of the keyframe: a vector of 2 to 16,384
+//! numbers, how two are compared (`"cosine"` or `"euclidean"`), and a name for what made it, for only vectors of one
+//! model are compared. Submaps that have one are proposed for alignment by it. A message may do without (in postcard:
+//! end with its landmarks).
 //!
 //! ```text
 //! "place": {"model": "netvlad-pitts30k", "metric": "cosine", "vector": [0.017, -0.004, 0.021]}
 //! ```
 //!
 //! A depth camera may send its image as it is, as `depth` instead of `points`: 16 bits a pixel, rectified, with the
-//! intrinsics of this very image in pixels and what one count is. `data` is, in JSON, the base64 of two bytes a pixel, low
-//! byte first (ROS's `16UC1`), or of a PNG of 16-bit grey if `encoding` is `"png"`; in postcard those bytes themselves.
-//! `range_m` (what to trust) and `t_body_camera` (without it the body is the camera: x right, y down, z forward) may be
-//! left out. Large images are thinned to 10,000 pixels; who wants other points sends points.
+//! intrinsics of this very image in pixels and what one count is. `data` is, in JSON, the base64 of two bytes a pixel,
+//! low byte first (ROS's `16UC1`), or of a PNG of 16-bit grey if `encoding` is `"png"`; in postcard those bytes
+//! themselves. `range_m` (what to trust) and `t_body_camera` (without it the body is the camera: x right, y down, z
+//! forward) may be left out. Large images are thinned to 10,000 pixels; who wants other points sends points.
 //!
 //! ```text
 //! "depth": {"width": 640, "height": 480, "fx": 585, "fy": 585, "cx": 320, "cy": 240, "unit_m": 0.001,
@@ -37,40 +37,41 @@
 //!           "encoding": "raw", "data": "6AMAAOgD…"}
 //! ```
 //!
-//! An organised cloud, which keeps the camera's or the LiDAR's grid, has NaN or infinity where nothing was measured: say
-//! `"organised": true` and such points are left out. Of any other cloud they are a mistake and refuse it. JSON has no NaN;
-//! there, leave the points out yourself.
+//! An organised cloud, which keeps the camera's or the LiDAR's grid, has NaN or infinity where nothing was measured:
+//! say `"organised": true` and such points are left out. Of any other cloud they are a mistake and refuse it. JSON has
+//! no NaN; there, leave the points out yourself.
 //!
-//! Poses are of an odometry frame: one in which the body moves and never jumps, however it drifts (`odom` in ROS's terms, not
-//! `map`). A SLAM that corrects its poses by loop closures sends them without the corrections, as the chain of motions from
-//! keyframe to keyframe: our joint estimate closes loops itself, and with a corrected pose it would take the correction for a
-//! motion. Small corrections (within `submap.distance_m`) pass unseen, and are as wrong as they are large; larger ones are
-//! refused, and if the SLAM stays there, a new epoch begins: a frame of its own, which merges with the old one by
-//! alignment. With `covariance_of = "pose"` the covariances of a chain are wanted, which do not shrink.
+//! Poses are of an odometry frame: one in which the body moves and never jumps, however it drifts (`odom` in ROS's
+//! terms, not `map`). A SLAM that corrects its poses by loop closures sends them without the corrections, as the chain
+//! of motions from keyframe to keyframe: our joint estimate closes loops itself, and with a corrected pose it would
+//! take the correction for a motion. Small corrections (within `submap.distance_m`) pass unseen, and are as wrong as
+//! they are large; larger ones are refused, and if the SLAM stays there, a new epoch begins: a frame of its own, which
+//! merges with the old one by alignment. With `covariance_of = "pose"` the covariances of a chain are wanted, which do
+//! not shrink.
 //!
-//! `session` tells of which run of the SLAM a keyframe is: a number that is larger with each start, such as the time of it.
-//! Another one begins a new epoch at once, since what a SLAM that was reset to its origin says has nothing to do with what it
-//! said before. Without it a reset shows only by the jump, if that is longer than a few keyframes' way, and a few keyframes
-//! are lost. Two that take turns are two SLAMs: of the one that began earlier all is refused. An agent that starts again itself
-//! remembers the session; where none was said it takes the SLAM to go on, and with one that was reset meanwhile must be run
-//! with `--new-epoch`. A message may do without (in postcard: end with its place).
+//! `session` tells of which run of the SLAM a keyframe is: a number that is larger with each start, such as the time of
+//! it. Another one begins a new epoch at once, since what a SLAM that was reset to its origin says has nothing to do
+//! with what it said before. Without it a reset shows only by the jump, if that is longer than a few keyframes' way,
+//! and a few keyframes are lost. Two that take turns are two SLAMs: of the one that began earlier all is refused. An
+//! agent that starts again itself remembers the session; where none was said it takes the SLAM to go on, and with one
+//! that was reset meanwhile must be run with `--new-epoch`. A message may do without (in postcard: end with its place).
 //!
 //! ```text
 //! "session": 1700000000
 //! ```
 //!
-//! `up` is the direction against gravity in the body frame, of length 1, if an inertial sensor tells it, and its standard
-//! deviation about each horizontal axis, rad (0.001 to 0.5; 0.02 if it is left out). If the frame's own z axis points up,
-//! say so in the configuration instead (`submap.gravity = "frame_z"`). A message may do without (in postcard: end with its
-//! place).
+//! `up` is the direction against gravity in the body frame, of length 1, if an inertial sensor tells it, and its
+//! standard deviation about each horizontal axis, rad (0.001 to 0.5; 0.02 if it is left out). If the frame's own z axis
+//! points up, say so in the configuration instead (`submap.gravity = "frame_z"`). A message may do without (in
+//! postcard: end with its place).
 //!
 //! ```text
 //! "up": {"direction": [0.012, -0.031, 0.9994], "sigma_rad": 0.01}
 //! ```
 //!
-//! A sighting of another robot states how it lies and is turned (`in/sighting`: `translation`, `rotation` and `covariance` of
-//! `t_body_other`, as in a keyframe); a range and a bearing, or a detection in an image of known depth, states where its
-//! body is alone (`in/position`), with the upper triangle of the 3×3 covariance, row by row:
+//! A sighting of another robot states how it lies and is turned (`in/sighting`: `translation`, `rotation` and
+//! `covariance` of `t_body_other`, as in a keyframe); a range and a bearing, or a detection in an image of known depth,
+//! states where its body is alone (`in/position`), with the upper triangle of the 3×3 covariance, row by row:
 //!
 //! ```text
 //! {"stamp_ns": 1700000000000000000, "robot": "beta", "position": [2.1, -0.4, 0.0],
@@ -241,8 +242,8 @@ fn states_points(json: &[u8]) -> bool {
     serde_json::from_slice::<BTreeMap<String, IgnoredAny>>(json).is_ok_and(|fields| fields.contains_key("points"))
 }
 
-/// A postcard message that ends with its points or with what was added after them until some day: the rest was not known
-/// yet. Each addition is a zero byte where there is nothing of it.
+/// A postcard message that ends with its points or with what was added after them until some day: the rest was not
+/// known yet. Each addition is a zero byte where there is nothing of it.
 fn of_earlier_days(bytes: &[u8]) -> Option<KeyframeMessage> {
     const ADDED: usize = 6;
     let completed = |missing: usize| {

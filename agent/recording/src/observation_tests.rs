@@ -62,8 +62,8 @@ fn a_place_travels_and_is_checked() {
     assert_eq!(serde_json::from_slice::<PlaceMessage>(written).unwrap().model, "");
 }
 
-/// What was added after the points, each a zero byte in a message that has none of it: up, session, organised, depth, place,
-/// landmarks, the last one first.
+/// What was added after the points, each a zero byte in a message that has none of it: up, session, organised, depth,
+/// place, landmarks, the last one first.
 const ADDED: usize = 6;
 
 #[test]

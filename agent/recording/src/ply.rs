@@ -202,8 +202,8 @@ fn ascii(header: &Header, body: &[u8]) -> Result<Vec<[f32; 3]>, Fault> {
     Ok(points)
 }
 
-/// The values of the named properties, vertex by vertex; of those that the vertices do not have, `None`. The file is one
-/// that [`parse`] reads.
+/// The values of the named properties, vertex by vertex; of those that the vertices do not have, `None`. The file is
+/// one that [`parse`] reads.
 pub(super) fn columns(bytes: &[u8], names: &[&str]) -> Result<Vec<Option<Vec<f64>>>, Fault> {
     let header = header(bytes)?;
     let body = &bytes[header.body..];

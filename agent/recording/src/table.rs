@@ -1,5 +1,5 @@
-//! `keyframes.csv`, `truth.csv` and their like: strict tables of numbers. A line that is not exactly what the header promises
-//! refuses the recording; nothing is guessed or skipped.
+//! `keyframes.csv`, `truth.csv` and their like: strict tables of numbers. A line that is not exactly what the header
+//! promises refuses the recording; nothing is guessed or skipped.
 
 use super::error::{Problem, RecordingError, on};
 use crate::manifest::{KEYFRAMES_HEADER, KEYFRAMES_MAX, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER};

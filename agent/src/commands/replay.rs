@@ -1,5 +1,5 @@
-//! `merganser replay`: the core again, on a journal. The same inputs give the same facts and the same digest; if they do
-//! not, something is not deterministic, and that is a bug worth a report with the journal.
+//! `merganser replay`: the core again, on a journal. The same inputs give the same facts and the same digest; if they
+//! do not, something is not deterministic, and that is a bug worth a report with the journal.
 
 use super::say;
 use crate::config::FileConfig;

@@ -113,8 +113,8 @@ async fn let_go(leash: bool) {
     }
 }
 
-/// Completes when this host has an address from which Zenoh will never scout. Whoever names peers is told and goes on: these
-/// are called again and again, from wherever we are.
+/// Completes when this host has an address from which Zenoh will never scout. Whoever names peers is told and goes on:
+/// these are called again and again, from wherever we are.
 async fn astray(scouting: Option<Scouting>, names_peers: bool) -> LinkError {
     let Some(mut scouting) = scouting else { return std::future::pending().await };
     loop {
@@ -187,8 +187,8 @@ async fn feed(inbox: Inbox, new_epoch: bool, recording: Option<Recording>, speed
     }
 }
 
-/// Feeds a recording in its own time, `speed` times faster, and closes the last submap. Where other robots were seen says
-/// something only in real time: how old their beacons are, nobody can tell whose time runs otherwise.
+/// Feeds a recording in its own time, `speed` times faster, and closes the last submap. Where other robots were seen
+/// says something only in real time: how old their beacons are, nobody can tell whose time runs otherwise.
 async fn play(inbox: &Inbox, recording: Recording, speed: f64) -> Result<()> {
     let begins = recording.begins();
     let positions = if speed == 1.0 { recording.positions().to_vec() } else { Vec::new() };

@@ -1,5 +1,5 @@
-//! `merganser watch`: a swarm from outside. A live table of what each robot says of itself, or every message that travels
-//! as a line of JSON. It only listens and asks for views: it holds no key and changes nothing.
+//! `merganser watch`: a swarm from outside. A live table of what each robot says of itself, or every message that
+//! travels as a line of JSON. It only listens and asks for views: it holds no key and changes nothing.
 
 use super::{runtime, say};
 use crate::config::{LogConfig, LogFormat, ZenohConfig};

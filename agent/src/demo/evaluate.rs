@@ -1,7 +1,7 @@
 //! Is the merged map right, and does it know how right it is? Every frame alignment is compared with the truth of the
-//! recordings: error e = log(t_true⁻¹ t_estimated), and NEES = eᵀ Σ⁻¹ e with the covariance the robots state (of the local
-//! perturbation, MATH §1), which is χ²₆ if the covariance is honest; χ²₇ where a robot's unit is unknown, and the error has a
-//! scale. All functions here are pure.
+//! recordings: error e = log(t_true⁻¹ t_estimated), and NEES = eᵀ Σ⁻¹ e with the covariance the robots state (of the
+//! local perturbation, MATH §1), which is χ²₆ if the covariance is honest; χ²₇ where a robot's unit is unknown, and the
+//! error has a scale. All functions here are pure.
 
 use super::track::Track;
 use super::trajectory::{self, Corrected, TrajectoryError};
@@ -35,8 +35,8 @@ pub struct Bounds {
     pub rotation_deg: f64,
 }
 
-/// Twice what a good odometry drifts, share of the way and degrees per metre. A frame lies where its robot set out; seen
-/// from where two robots met, it is as far off as the odometry from there to there.
+/// Twice what a good odometry drifts, share of the way and degrees per metre. A frame lies where its robot set out;
+/// seen from where two robots met, it is as far off as the odometry from there to there.
 const DRIFT: (f64, f64) = (0.01, 0.004);
 
 impl Bounds {
@@ -67,9 +67,9 @@ pub struct PoseError {
 }
 
 impl PoseError {
-    /// The error of `estimate` (Σ of the local perturbation) against `truth`, where one is `unit_m` in the frame that both
-    /// map into. A rigid estimate claims that the units are the same: where they are not, its error has a scale, too, far
-    /// outside what it claims.
+    /// The error of `estimate` (Σ of the local perturbation) against `truth`, where one is `unit_m` in the frame that
+    /// both map into. A rigid estimate claims that the units are the same: where they are not, its error has a scale,
+    /// too, far outside what it claims.
     pub fn of(estimate: &Relative, truth: &Sim3, unit_m: f64) -> Self {
         let sim = estimate.sim();
         let (xi, nees, degrees_of_freedom) = match estimate {
@@ -306,8 +306,8 @@ fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: &Bounds) ->
     checks
 }
 
-/// How two frames are related. Where one's unit is unknown that must be a similarity, whatever the units happen to be, and
-/// nobody can say how far off it is unless the recordings state the units.
+/// How two frames are related. Where one's unit is unknown that must be a similarity, whatever the units happen to be,
+/// and nobody can say how far off it is unless the recordings state the units.
 fn pair_check(tracks: [&Track; 2], pair: &Pair, truths: bool, bounds: &Bounds) -> Option<Check> {
     let scaled = tracks.iter().any(|track| track.scale == ScaleKind::Unknown);
     let judged = truths && tracks.iter().all(|track| track.unit_m.is_some());

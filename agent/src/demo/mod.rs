@@ -1,5 +1,5 @@
-//! The demonstration: an agent process per recording, over real Zenoh, watched from outside until all hold one map; then
-//! the map is compared with the recordings' truth, and everything is printed, written and drawn.
+//! The demonstration: an agent process per recording, over real Zenoh, watched from outside until all hold one map;
+//! then the map is compared with the recordings' truth, and everything is printed, written and drawn.
 
 mod bundle;
 pub mod evaluate;

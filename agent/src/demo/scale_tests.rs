@@ -1,4 +1,5 @@
-//! The evaluation of robots whose units nobody knew: the same map as in the other tests, each robot in a unit of its own.
+//! The evaluation of robots whose units nobody knew: the same map as in the other tests, each robot in a unit of its
+//! own.
 
 use super::evaluate::{CHI2_7_95, Evaluation, PoseError, evaluate};
 use super::outputs::{Cloud, Outcome};

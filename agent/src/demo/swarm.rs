@@ -1,5 +1,5 @@
-//! The agents of the demonstration: child processes of this program, each with a key, a configuration, a store and a log
-//! of its own, linked over loopback. They end with the value that holds them.
+//! The agents of the demonstration: child processes of this program, each with a key, a configuration, a store and a
+//! log of its own, linked over loopback. They end with the value that holds them.
 
 use crate::config::FileConfig;
 use crate::recording::Recording;

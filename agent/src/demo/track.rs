@@ -48,8 +48,8 @@ impl Track {
         steps.sum::<f64>() * self.unit_m.unwrap_or(1.0)
     }
 
-    /// `t_world_frame`: where the robot's local frame truly lies, and what its unit is, m. A frame is defined by its first
-    /// keyframe, where the odometry has not drifted yet. `None` without truth or unit.
+    /// `t_world_frame`: where the robot's local frame truly lies, and what its unit is, m. A frame is defined by its
+    /// first keyframe, where the odometry has not drifted yet. `None` without truth or unit.
     pub fn t_world_frame(&self) -> Option<Sim3> {
         self.t_world_frame_at(0)
     }

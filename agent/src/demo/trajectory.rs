@@ -18,8 +18,9 @@ pub struct Corrected {
     pub anchors: Vec<Relative>,
 }
 
-/// Moves a robot's odometry along with its submaps: t_ref_body = t_ref_anchor ∘ t_frame_anchor⁻¹ ∘ t_frame_body with the
-/// anchor of the submap that the keyframe belongs to. `None` if the reference robot does not know where `frame` lies.
+/// Moves a robot's odometry along with its submaps: t_ref_body = t_ref_anchor ∘ t_frame_anchor⁻¹ ∘ t_frame_body with
+/// the anchor of the submap that the keyframe belongs to. `None` if the reference robot does not know where `frame`
+/// lies.
 pub fn correct(track: &Track, reference: &Views, frame: &str) -> Option<Corrected> {
     let mut submaps: Vec<_> = reference.map.submaps.iter().filter(|submap| submap.frame == frame).collect();
     submaps.sort_by_key(|submap| submap.index);
@@ -39,8 +40,8 @@ pub fn correct(track: &Track, reference: &Views, frame: &str) -> Option<Correcte
     Some(Corrected { poses: poses.collect(), anchors })
 }
 
-/// True `t_world_anchor` of a submap, `name/epoch#index`: the anchor moves with the keyframe it was placed at, the one of
-/// the submap's span whose odometry is the anchor's.
+/// True `t_world_anchor` of a submap, `name/epoch#index`: the anchor moves with the keyframe it was placed at, the one
+/// of the submap's span whose odometry is the anchor's.
 pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Sim3> {
     let (frame, index) = submap.rsplit_once('#')?;
     let index: u32 = index.parse().ok()?;
@@ -103,8 +104,8 @@ fn rms(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> f64 {
     (sum / a.len().max(1) as f64).sqrt()
 }
 
-/// The similarity T with the least Σ |T aᵢ − bᵢ|² (Umeyama): the rotation is that of the rigid motion, and the scale the
-/// least squares one after it. Points that all lie in one place have no size; they are moved rigidly.
+/// The similarity T with the least Σ |T aᵢ − bᵢ|² (Umeyama): the rotation is that of the rigid motion, and the scale
+/// the least squares one after it. Points that all lie in one place have no size; they are moved rigidly.
 pub fn fit_similarity(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> Sim3 {
     let rotation = fit(a, b).rotation;
     let (centre_a, centre_b) = (mean(a), mean(b));

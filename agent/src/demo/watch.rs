@@ -48,8 +48,8 @@ pub(super) struct Seen {
     pub views: Vec<Views>,
 }
 
-/// Looks on until the end; `playing`, which the recordings take, and `timeout` count from now. While a recording plays, its
-/// robot may stand for minutes and drive on.
+/// Looks on until the end; `playing`, which the recordings take, and `timeout` count from now. While a recording plays,
+/// its robot may stand for minutes and drive on.
 pub(super) async fn watch(swarm: &mut Swarm, tracks: &[Track], playing: Duration, timeout: Duration) -> Result<Seen> {
     let config = ZenohConfig { connect: swarm.endpoints.clone(), multicast: false, ..ZenohConfig::default() };
     let session = session::open(&config, Role::Onlooker).await?;

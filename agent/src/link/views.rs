@@ -1,6 +1,6 @@
 //! What the agent shows: its views as JSON, for whoever asks, and published while somebody subscribes. One snapshot
-//! serves all that ask within a short time, so that asking cannot slow the core down. The map, which alone may take many
-//! megabytes, is made only for those who want it.
+//! serves all that ask within a short time, so that asking cannot slow the core down. The map, which alone may take
+//! many megabytes, is made only for those who want it.
 
 use super::session::LinkError;
 use super::{Shared, refused};

@@ -1,5 +1,6 @@
-//! The picture of a merge. Left, before: every robot's map in its own frame, drawn on top of one another as if the frames
-//! were the same. Right, after: one map, with true paths, alignments and the 95 % ellipses of the anchors' positions.
+//! The picture of a merge. Left, before: every robot's map in its own frame, drawn on top of one another as if the
+//! frames were the same. Right, after: one map, with true paths, alignments and the 95 % ellipses of the anchors'
+//! positions.
 
 use super::plan::plan;
 use super::svg::{Anchor, Svg};

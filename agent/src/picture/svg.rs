@@ -1,4 +1,5 @@
-//! A small SVG writer: just the shapes that our pictures need. Coordinates are pixels, y down, printed with one decimal.
+//! A small SVG writer: just the shapes that our pictures need. Coordinates are pixels, y down, printed with one
+//! decimal.
 
 use std::fmt::Write as _;
 

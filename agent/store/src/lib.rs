@@ -1,13 +1,14 @@
-//! The disk: one redb database per robot, in which facts are durable before anyone hears of them (DESIGN §4). Each commit
-//! is atomic and synced, and quick repair makes reopening after a crash a matter of milliseconds. There is no clock and
-//! no thread here, and the file may be any [`Medium`]: the agent brings a file, the simulator a disk that fails.
+//! The disk: one redb database per robot, in which facts are durable before anyone hears of them (DESIGN §4). Each
+//! commit is atomic and synced, and quick repair makes reopening after a crash a matter of milliseconds. There is no
+//! clock and no thread here, and the file may be any [`Medium`]: the agent brings a file, the simulator a disk that
+//! fails.
 //!
 //! What it promises, and how:
 //! - *A commit that was confirmed is there after any crash*: two-phase commits, synced.
 //! - *Damage is found*: opening checks the database's own checksums and a seal over each record and its key. What is
-//!   sound goes into a new file that takes the old one's place; what is not is counted, dropped, and can be fetched from
-//!   peers again. If an entry may be missing, this robot's log must not be continued, for others may hold what is lost:
-//!   [`Record::EpochClosed`] says so, at every start until a later epoch has begun.
+//!   sound goes into a new file that takes the old one's place; what is not is counted, dropped, and can be fetched
+//!   from peers again. If an entry may be missing, this robot's log must not be continued, for others may hold what is
+//!   lost: [`Record::EpochClosed`] says so, at every start until a later epoch has begun.
 //! - *A disk that refuses loses nothing*: a failed commit stores nothing of its batch; the next one opens the database
 //!   again. After anything but a full disk the records are first copied into a new file, since a kernel forgets pages
 //!   that it could not write.

@@ -2,8 +2,8 @@
 //! lie, there can be no room, operations can fail, bits can flip at rest, and an old image can come back. Everything it
 //! does is a function of the numbers it is given, so that a simulation replays.
 //!
-//! A failed sync follows what kernels do: part of what was written reaches the disk, none of the rest ever will by a later
-//! sync, and reading still shows all of it until the power is cut.
+//! A failed sync follows what kernels do: part of what was written reaches the disk, none of the rest ever will by a
+//! later sync, and reading still shows all of it until the power is cut.
 
 use crate::Medium;
 use redb::{Builder, Database, DatabaseError, StorageBackend};

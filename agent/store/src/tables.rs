@@ -1,7 +1,7 @@
 //! The tables: how keys and sealed values look, and how records are put into them.
 //!
-//! A seal is the first eight bytes of BLAKE3 over table, key and value. Flipped bits in either are found when the record
-//! is read, whatever the database thinks of the page that holds it.
+//! A seal is the first eight bytes of BLAKE3 over table, key and value. Flipped bits in either are found when the
+//! record is read, whatever the database thinks of the page that holds it.
 
 use crate::CommitError;
 use merganser_protocol::agent::io::Record;

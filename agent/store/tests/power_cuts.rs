@@ -1,5 +1,5 @@
-//! Five thousand power cuts, each at some write or sync of some commit, with torn sectors: no entry that was confirmed is
-//! lost, and no place in the log is written twice.
+//! Five thousand power cuts, each at some write or sync of some commit, with torn sectors: no entry that was confirmed
+//! is lost, and no place in the log is written twice.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "a test fails by panicking")]
 
 mod common;

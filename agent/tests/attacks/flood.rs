@@ -1,6 +1,6 @@
-//! A member of the swarm that talks of ten thousand robots a second that nobody knows: facts of unknown origin under its
-//! own key, and messages under names that no roster has. Two honest agents must go on to hold the same facts while the
-//! flood lasts, and must not grow with what they refuse.
+//! A member of the swarm that talks of ten thousand robots a second that nobody knows: facts of unknown origin under
+//! its own key, and messages under names that no roster has. Two honest agents must go on to hold the same facts while
+//! the flood lasts, and must not grow with what they refuse.
 
 use super::common::{swarm, until};
 use super::outsider::{Agent, Outsider, Voice, sighting};
@@ -72,8 +72,8 @@ async fn strangers_in_any_number_cost_no_memory_and_stop_nobody() {
     outsider.leave().await;
 }
 
-/// Has alpha state facts, and waits until beta holds them: how long that took, s. Sightings are numbered from `first`, and
-/// of the outsider, who says where it is: of the others the last keyframe may be too long ago.
+/// Has alpha state facts, and waits until beta holds them: how long that took, s. Sightings are numbered from `first`,
+/// and of the outsider, who says where it is: of the others the last keyframe may be too long ago.
 async fn state(outsider: &mut Outsider, first: u64) -> f64 {
     let entries = outsider.status("alpha").await.entries;
     let wanted = entries + HONEST_FACTS / 2; // an own queue may be full, too, but not for long

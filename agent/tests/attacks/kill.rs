@@ -1,6 +1,6 @@
 //! Kill −9 at random moments, again and again on one store: while the agent starts, while it describes submaps, and
-//! while facts are written as fast as they can be. Whatever it had told anybody it must still hold after the restart, in
-//! the same place with the same bytes; and it must go on with the same log, without a second entry in any place.
+//! while facts are written as fast as they can be. Whatever it had told anybody it must still hold after the restart,
+//! in the same place with the same bytes; and it must go on with the same log, without a second entry in any place.
 
 use super::common::{keyframe, name, swarm, until};
 use super::number;

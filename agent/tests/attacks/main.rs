@@ -1,5 +1,5 @@
-//! Attacks on the real program over real Zenoh, on loopback: it is killed at any moment, and flooded by strangers. A plain
-//! `cargo test` runs some of each; how many more is for the environment to say:
+//! Attacks on the real program over real Zenoh, on loopback: it is killed at any moment, and flooded by strangers. A
+//! plain `cargo test` runs some of each; how many more is for the environment to say:
 //!
 //! ```sh
 //! MERGANSER_KILLS=500 cargo test --release -p merganser --test attacks -- --ignored --test-threads=1 --nocapture

@@ -1,5 +1,5 @@
-//! What the network tests share: swarms on loopback with free ports and no multicast, a stand-in for the core, keyframes
-//! of a room, and waiting with an end.
+//! What the network tests share: swarms on loopback with free ports and no multicast, a stand-in for the core,
+//! keyframes of a room, and waiting with an end.
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use merganser::config::FileConfig;

@@ -1,6 +1,6 @@
 //! The real program on real Zenoh over bad networks: three agents, each in a network namespace of its own, on a bridge
-//! whose faults are real ones of the kernel (DESIGN §9). Whatever happens on the way,
-//! all robots must end with the same facts, byte for byte; nothing is asked about how long it takes, except that it ends.
+//! whose faults are real ones of the kernel (DESIGN §9). Whatever happens on the way, all robots must end with the same
+//! facts, byte for byte; nothing is asked about how long it takes, except that it ends.
 //!
 //! Needs root, `ip`, `tc` and `nft`, and a few minutes, so it is not part of a plain `cargo test`:
 //!

@@ -261,7 +261,8 @@ impl<'a> Robot<'a> {
     pub fn links(&self) -> Vec<Ipv4Addr> {
         let agent = self.agent.as_ref().unwrap().0.id();
         let read = |table: &str| fs::read_to_string(format!("/proc/{agent}/net/{table}")).unwrap();
-        // An IPv4 connection to a socket that serves both is listed with the IPv6 ones, its address in the last 8 digits.
+        // An IPv4 connection to a socket that serves both is listed with the IPv6 ones, its address in the last 8
+        // digits.
         let (v4, v6) = (read("tcp"), read("tcp6"));
         let address = |line: &str| {
             let fields: Vec<&str> = line.split_whitespace().collect();

@@ -1,6 +1,6 @@
 //! An ordinary Zenoh subscriber beside each robot: a process in the robot's namespace that asks the agent for its views
-//! over the loopback of that namespace, which no fault touches, and writes down each answer as a line of JSON. It is this
-//! test program, started anew.
+//! over the loopback of that namespace, which no fault touches, and writes down each answer as a line of JSON. It is
+//! this test program, started anew.
 
 use super::common::name;
 use merganser::config::ZenohConfig;

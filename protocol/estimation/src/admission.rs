@@ -113,8 +113,8 @@ impl Admission {
         Some(Around { walk: self.walk(id)?, steps: [step(index.checked_sub(1)), step(Some(index))] })
     }
 
-    /// The first and the last anchor of a frame and the walks while their submaps were made, as far as their neighbours'
-    /// steps tell. Of a single step nobody knows whether it leads over a gap.
+    /// The first and the last anchor of a frame and the walks while their submaps were made, as far as their
+    /// neighbours' steps tell. Of a single step nobody knows whether it leads over a gap.
     pub(super) fn ends(&self, frame: FrameId) -> Option<[(SubmapId, DriftModel); 2]> {
         let last = self.chains.get(&frame)?.len().checked_sub(1).filter(|&last| last > 1)?;
         let last = u32::try_from(last).ok()?;
@@ -181,8 +181,8 @@ impl Admission {
         self.edges.iter_mut().find(is_it).map(|e| e.refuse(reason)).is_some()
     }
 
-    /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst, or, where there
-    /// is too little memory, of the one with the most edges; whether any counted until now.
+    /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst, or, where
+    /// there is too little memory, of the one with the most edges; whether any counted until now.
     pub(super) fn isolate_worst(&mut self, frames: &BTreeSet<FrameId>, error: SolveError) -> bool {
         let counts =
             |e: &EdgeEstimate, f: FrameId| e.is_used() && [e.measurement.i.frame, e.measurement.j.frame].contains(&f);
@@ -212,8 +212,8 @@ impl Admission {
         place.into_iter().map(|(f, k)| (f, sets.root(k))).collect()
     }
 
-    /// Sets aside what lies between frames that nothing merges any more: neither sightings nor second looks ever do, nor
-    /// alignments of pairs that did not merge by themselves.
+    /// Sets aside what lies between frames that nothing merges any more: neither sightings nor second looks ever do,
+    /// nor alignments of pairs that did not merge by themselves.
     pub(super) fn drop_strays(&mut self) {
         let groups = self.groups();
         let stray = |e: &&mut EdgeEstimate| {

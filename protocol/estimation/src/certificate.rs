@@ -1,10 +1,10 @@
 //! Whether a minimum of the chordal cost is the global one: the dual certificate of SE-Sync (Rosen et al. 2019, §4.2).
 //!
-//! With the cost `tr(M XᵀX)` in `X = [R t]` and the multipliers `Λ_i = sym(R_iᵀ (X M)_i)` of the rotations' constraints,
-//! a stationary point is a global minimum if `S = M − Λ` is positive semidefinite once translations are eliminated. If
-//! its smallest eigenvalue is `λ < 0` instead, the cost exceeds the global minimum by at most `3n|λ|`, because the
-//! squared norm of the rotations is 3n. Here `S + ηI` is factorised, η as small as the wanted gap allows: that it can
-//! be proves `λ ≥ −η`. Lanczos on its inverse (faer's) then gives λ itself.
+//! With the cost `tr(M XᵀX)` in `X = [R t]` and the multipliers `Λ_i = sym(R_iᵀ (X M)_i)` of the rotations'
+//! constraints, a stationary point is a global minimum if `S = M − Λ` is positive semidefinite once translations are
+//! eliminated. If its smallest eigenvalue is `λ < 0` instead, the cost exceeds the global minimum by at most `3n|λ|`,
+//! because the squared norm of the rotations is 3n. Here `S + ηI` is factorised, η as small as the wanted gap allows:
+//! that it can be proves `λ ≥ −η`. Lanczos on its inverse (faer's) then gives λ itself.
 
 use super::chordal::{ChordalEdge, ChordalGraph, Pose};
 use super::solve::SolveError;

@@ -1,5 +1,6 @@
-//! The chordal cost of pose graphs, `F = Σ κ‖R_j − R_i R_ij‖²_F + τ‖t_j − t_i − R_i t_ij‖²` (Rosen et al. 2019, "SE-Sync",
-//! eq. 3), with `κ (6 − 2 tr(R_jᵀ R_i R_ij))` for the first term where R_ij is only nearly a rotation: decides where a minimisation starts that odometry would lead astray, and finds the minimum that
+//! The chordal cost of pose graphs, `F = Σ κ‖R_j − R_i R_ij‖²_F + τ‖t_j − t_i − R_i t_ij‖²` (Rosen et al. 2019,
+//! "SE-Sync", eq. 3), with `κ (6 − 2 tr(R_jᵀ R_i R_ij))` for the first term where R_ij is only nearly a rotation:
+//! decides where a minimisation starts that odometry would lead astray, and finds the minimum that
 //! [`super::certificate`] can prove to be global.
 //!
 //! Start: without the constraint that rotations be rotations, two linear least-squares problems (Carlone et al. 2015,

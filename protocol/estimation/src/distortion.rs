@@ -1,28 +1,28 @@
-//! What an alignment of two clouds cannot know: part of its error is common to all alignments of a submap, because a depth
-//! camera bends every view of a place alike and all of them see the same noisy points, so that it neither averages out
-//! over alignments nor shows in their residuals.
+//! What an alignment of two clouds cannot know: part of its error is common to all alignments of a submap, because a
+//! depth camera bends every view of a place alike and all of them see the same noisy points, so that it neither
+//! averages out over alignments nor shows in their residuals.
 //!
 //! Where submap k's cloud lies by its anchor is unknown by that much: `X_k' = X_k Exp(d_k)`, `d_k ~ N(0, C_k)`. In the
 //! joint graph a submap with several alignments gets a node `X_k'` (a *cloud*), a factor with covariance `C_k` to its
-//! anchor, and its alignments tie the clouds instead of the anchors, with what is left of their covariances. So errors are
-//! correlated as they are, and no alignment is worth less for there being others. Each alignment of covariance Σ suggests
-//! `C = c Σ`, c = [`MapProblem::common`](super::joint::MapProblem::common); the harmonic mean of them all is taken, and
-//! of Σ each end takes away what lies in both `c Σ` and `C_k`, so that none ever claims more than Σ.
+//! anchor, and its alignments tie the clouds instead of the anchors, with what is left of their covariances. So errors
+//! are correlated as they are, and no alignment is worth less for there being others. Each alignment of covariance Σ
+//! suggests `C = c Σ`, c = [`MapProblem::common`](super::joint::MapProblem::common); the harmonic mean of them all is
+//! taken, and of Σ each end takes away what lies in both `c Σ` and `C_k`, so that none ever claims more than Σ.
 //!
 //! Where alignments are taken as independent, in the consensus of two frames, an alignment is widened by what it has in
-//! common with the others between the two, `1 + c (n_i − 1) + c (n_j − 1)` for n alignments of its submaps: the variance
-//! of the mean of as many. The same is done for similarities everywhere, as a cloud has no scale of its own.
+//! common with the others between the two, `1 + c (n_i − 1) + c (n_j − 1)` for n alignments of its submaps: the
+//! variance of the mean of as many. The same is done for similarities everywhere, as a cloud has no scale of its own.
 //!
-//! *Measured* on 7-Scenes with almost no odometry drift, where nothing else is left: with alignments charged a quarter of
-//! what they have in common if that is all of their error, the merged frames have a NEES of 18 for 6 degrees of freedom,
-//! charged in full 7.6. Over 2,670 pairs of alignments of one ray-cast LiDAR submap: their errors correlate by 0.14 and 0.21
-//! (translation, rotation).
+//! *Measured* on 7-Scenes with almost no odometry drift, where nothing else is left: with alignments charged a quarter
+//! of what they have in common if that is all of their error, the merged frames have a NEES of 18 for 6 degrees of
+//! freedom, charged in full 7.6. Over 2,670 pairs of alignments of one ray-cast LiDAR submap: their errors correlate by
+//! 0.14 and 0.21 (translation, rotation).
 //!
-//! Odometry that drifts bends the cloud, too: its middle lies off its anchor, the middle keyframe, by about a twelfth of
-//! the variance of the walk while it was made (`walk`). So much is added to `C_k`. *Measured* in swarms of stand-in clouds
-//! that drift so (`merganser-sim bench calibration`): without it the submaps' NEES is 1.18 by degrees of freedom. What goes
-//! with the odometry on either side is told to the graph by `bend`, and to who goes on from the map by
-//! [`ends`](super::extrapolation).
+//! Odometry that drifts bends the cloud, too: its middle lies off its anchor, the middle keyframe, by about a twelfth
+//! of the variance of the walk while it was made (`walk`). So much is added to `C_k`. *Measured* in swarms of stand-in
+//! clouds that drift so (`merganser-sim bench calibration`): without it the submaps' NEES is 1.18 by degrees of
+//! freedom. What goes with the odometry on either side is told to the graph by `bend`, and to who goes on from the map
+//! by [`ends`](super::extrapolation).
 
 use super::admission::Kind;
 use super::graph::{Factor, Label};
@@ -99,7 +99,8 @@ pub(super) fn charge(edges: &mut [EdgeEstimate]) {
     }
 }
 
-/// The factors of measurements that count, and of the clouds that they tie, and what these owe to the odometry around them.
+/// The factors of measurements that count, and of the clouds that they tie, and what these owe to the odometry around
+/// them.
 pub(super) fn factors<'a>(
     edges: &[&EdgeEstimate],
     odometry: impl Fn(SubmapId) -> Option<Around<'a>>,

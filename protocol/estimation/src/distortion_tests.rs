@@ -15,8 +15,8 @@ fn sigmas() -> Vector6<f64> {
     Vector6::from([ALIGNMENT.0, ALIGNMENT.0, ALIGNMENT.0, ALIGNMENT.1, ALIGNMENT.1, ALIGNMENT.1])
 }
 
-/// Three robots side by side, many submaps of any two of them aligned, with errors that come from the submaps to twice the
-/// share `common`, stated as large as they are, and of clouds that their odometry bent.
+/// Three robots side by side, many submaps of any two of them aligned, with errors that come from the submaps to twice
+/// the share `common`, stated as large as they are, and of clouds that their odometry bent.
 fn bent_world(rng: &mut ChaCha8Rng, common: f64) -> World {
     const ANCHORS: u32 = 8;
     let Walked { mut world, clouds, .. } = walked(rng, 3, ANCHORS as usize, 5);
@@ -108,8 +108,8 @@ fn a_single_alignment_of_a_submap_is_left_as_it_is() {
     assert_eq!(factors(&all, |_| None).0, all.iter().map(|edge| edge.factor()).collect::<Vec<_>>());
 }
 
-/// What its clouds are uncertain by and what is left of it, together, are never less than an alignment's covariance, and
-/// no more where all are alike.
+/// What its clouds are uncertain by and what is left of it, together, are never less than an alignment's covariance,
+/// and no more where all are alike.
 #[test]
 fn no_alignment_claims_more_than_it_did() {
     let rng = &mut rng(2);

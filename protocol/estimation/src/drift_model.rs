@@ -1,14 +1,14 @@
-//! How a submap's cloud follows the odometry that made it. Odometry loses its way at random, a little with every keyframe;
-//! the cloud lies where its keyframes do in the mean, its anchor is the middle one
-//! (`submap::builder` of the registration).
+//! How a submap's cloud follows the odometry that made it. Odometry loses its way at random, a little with every
+//! keyframe; the cloud lies where its keyframes do in the mean, its anchor is the middle one (`submap::builder` of the
+//! registration).
 //!
-//! Of n keyframes b = ⌊(n−1)/2⌋ come before the anchor and a = n−1−b after it, and from anchor to anchor it is n steps, each
-//! of `W/n` if `W` is the walk. A step that has k keyframes beyond it, seen from the anchor, moves the cloud by `k/n`. Hence
-//! the cloud lies off its anchor by `W (Σ_{k≤a} k² + Σ_{k≤b} k²)/n³`, and what is lost from the anchor to the last keyframe,
-//! `W a/n`, goes with that by `W a(a+1)/2n²`, as does, with b for a, what is lost from the anchor back to the first. For ever
-//! more keyframes these tend to `W/12`, `W/2` and `W/8`, which are taken where nobody told how many they are. Few are far
-//! from it: of four, two come after the anchor and one before it, and of what is lost there the cloud follows three eighths
-//! and a quarter.
+//! Of n keyframes b = ⌊(n−1)/2⌋ come before the anchor and a = n−1−b after it, and from anchor to anchor it is n steps,
+//! each of `W/n` if `W` is the walk. A step that has k keyframes beyond it, seen from the anchor, moves the cloud by
+//! `k/n`. Hence the cloud lies off its anchor by `W (Σ_{k≤a} k² + Σ_{k≤b} k²)/n³`, and what is lost from the anchor to
+//! the last keyframe, `W a/n`, goes with that by `W a(a+1)/2n²`, as does, with b for a, what is lost from the anchor
+//! back to the first. For ever more keyframes these tend to `W/12`, `W/2` and `W/8`, which are taken where nobody told
+//! how many they are. Few are far from it: of four, two come after the anchor and one before it, and of what is lost
+//! there the cloud follows three eighths and a quarter.
 
 use crate::geometry::Covariance;
 use core::num::NonZero;

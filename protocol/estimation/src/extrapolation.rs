@@ -1,23 +1,23 @@
-//! How frames begin and robots go on from their last submaps: what the motion of a body since the last anchor has to do with
-//! where the map says that anchor is, and the same of the origin and the first anchor.
+//! How frames begin and robots go on from their last submaps: what the motion of a body since the last anchor has to do
+//! with where the map says that anchor is, and the same of the origin and the first anchor.
 //!
 //! The two are not independent. A submap's anchor is its middle keyframe, and what alignments tell of is its cloud, of
-//! which the keyframes after the anchor made a half ([`distortion`](super::distortion)). Where odometry lost its way among
-//! them, the cloud lies off its anchor to that side, the map takes the anchor to lie off to the other, and of the two errors
-//! the body has the difference. To sum their variances would make live poses look worse than they are.
+//! which the keyframes after the anchor made a half ([`distortion`](super::distortion)). Where odometry lost its way
+//! among them, the cloud lies off its anchor to that side, the map takes the anchor to lie off to the other, and of the
+//! two errors the body has the difference. To sum their variances would make live poses look worse than they are.
 //!
-//! With `d` what the cloud's factor is off by (where the cloud lies by its anchor, but for what the steps of odometry to and
-//! from that tell of it: `bend`), of covariance Σ_d, and ν what the motion from the anchor is off by, both by
-//! local perturbations at the anchor, `X = Cov(d, ν)`. Of ν, `Xᵀ Σ_d⁻¹ d` is told by d and the rest by nothing in the map, so
-//! that the error δ of the anchor goes with ν by `Cov(δ, ν) = P Σ_d⁻¹ X`, with P the map's `Cov(δ, d)`. A random walk loses
-//! about half of its variance after the anchor, and the cloud follows what is lost there by about a quarter
-//! (`walk` knows it from how many keyframes there are). `X` is that share of what is lost there, or of the
+//! With `d` what the cloud's factor is off by (where the cloud lies by its anchor, but for what the steps of odometry
+//! to and from that tell of it: `bend`), of covariance Σ_d, and ν what the motion from the anchor is off by, both by
+//! local perturbations at the anchor, `X = Cov(d, ν)`. Of ν, `Xᵀ Σ_d⁻¹ d` is told by d and the rest by nothing in the
+//! map, so that the error δ of the anchor goes with ν by `Cov(δ, ν) = P Σ_d⁻¹ X`, with P the map's `Cov(δ, d)`. A
+//! random walk loses about half of its variance after the anchor, and the cloud follows what is lost there by about a
+//! quarter (`walk` knows it from how many keyframes there are). `X` is that share of what is lost there, or of the
 //! whole motion where that is less: a submap may be cut short.
 //!
-//! A frame begins as it ends: its origin is the first keyframe, which is one of those that made the first submap, and what
-//! the odometry lost from there to the first anchor bent the first cloud likewise. *Measured* in swarms of LiDARs whose
-//! alignments are surer than their odometry (σ of 8 mm): without it the relations of frames have a NEES of 0.80 by degrees
-//! of freedom.
+//! A frame begins as it ends: its origin is the first keyframe, which is one of those that made the first submap, and
+//! what the odometry lost from there to the first anchor bent the first cloud likewise. *Measured* in swarms of LiDARs
+//! whose alignments are surer than their odometry (σ of 8 mm): without it the relations of frames have a NEES of 0.80
+//! by degrees of freedom.
 
 use super::drift_model::Stretch;
 use super::solve::Solution;
@@ -25,8 +25,8 @@ use crate::geometry::{Covariance, PoseWithCovariance};
 use crate::ids::SubmapId;
 use nalgebra::Matrix6;
 
-/// How a keyframe lies by an anchor, if the map tells of the anchor's cloud: the motion from the last anchor to the body, or
-/// from the first one back to the origin of the frame.
+/// How a keyframe lies by an anchor, if the map tells of the anchor's cloud: the motion from the last anchor to the
+/// body, or from the first one back to the origin of the frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct End {
     /// `P Σ_d⁻¹`.

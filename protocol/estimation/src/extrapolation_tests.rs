@@ -12,7 +12,8 @@ const ANCHORS: usize = 6;
 const MANY: u16 = 17;
 const FEW: u16 = 4;
 
-/// Robots side by side whose alignments are surer than their odometry: that is where clouds count. And their last bodies.
+/// Robots side by side whose alignments are surer than their odometry: that is where clouds count. And their last
+/// bodies.
 fn world_of_walks(rng: &mut ChaCha8Rng, keyframes: u16) -> (World, Vec<Body>) {
     let Walked { mut world, clouds, bodies } = walked(rng, 3, ANCHORS, keyframes);
     let covariance = sigmas(ALIGNMENT.0, ALIGNMENT.1).scaled(0.1);
@@ -75,7 +76,8 @@ fn who_tells_of_few_keyframes_is_believed_to_be_surer() {
     assert!(told > 1.05 * untold, "{told} {untold}");
 }
 
-/// What the odometry lost between the origin and the first anchor bent the first cloud: frames are surer than if it had not.
+/// What the odometry lost between the origin and the first anchor bent the first cloud: frames are surer than if it had
+/// not.
 #[test]
 fn frames_are_surer_of_where_they_begin_and_not_surer_than_they_are() {
     let (mut together, mut independent, mut count) = (0.0, 0.0, 0.0);

@@ -6,13 +6,13 @@
 //! squares with cross-covariances, and a leave-one-out χ² test, marginalised over the scale, that drops what the others
 //! do not predict. The settled sets are candidates of an explanation: one set that speaks of one transform, or two that
 //! speak of two, by σ-marginalised evidence of their stacked residuals. Frames merge at a number of false alarms (NFA)
-//! < 1e-4 and 3 alignments beyond doubt, unless a second set has about as many members as the first. A doubtful alignment
-//! is not used, and where the answer hangs on it the frames do not merge. Same set of alignments, same answer to the bit, in
-//! any order.
+//! < 1e-4 and 3 alignments beyond doubt, unless a second set has about as many members as the first. A doubtful
+//! alignment is not used, and where the answer hangs on it the frames do not merge. Same set of alignments, same answer
+//! to the bit, in any order.
 //!
 //! *Measured* by `merganser-sim bench frames` over thousands of worlds: 4 true alignments against 3 of one lie merge
-//! rightly in 99.1 to 99.8 %, 4 against 4 are ambiguous in 99.9 to 100 %. The NFA alone, without evidence, reaches 97 and
-//! merges 0.3 % of the former wrongly; the prototype of MATH §5, over 400 worlds, 97.8 and 2.3 %.
+//! rightly in 99.1 to 99.8 %, 4 against 4 are ambiguous in 99.9 to 100 %. The NFA alone, without evidence, reaches 97
+//! and merges 0.3 % of the former wrongly; the prototype of MATH §5, over 400 worlds, 97.8 and 2.3 %.
 
 pub(super) mod clique;
 mod decide;
@@ -64,8 +64,8 @@ pub struct FrameConsensusConfig {
     /// Largest factor by which true standard deviations may exceed the stated ones.
     pub covariance_scale_max: f64,
     /// Least edge of the box in which a false alignment may fall, in frame units; trajectories longer than that enlarge
-    /// it. Also the length beside which it is small what doubtful alignments may move. Choose the reach of an alignment: about a
-    /// submap's diameter.
+    /// it. Also the length beside which it is small what doubtful alignments may move. Choose the reach of an
+    /// alignment: about a submap's diameter.
     pub search_edge_min: f64,
     /// How a false alignment may be turned.
     pub rotations: Rotations,
@@ -96,8 +96,8 @@ pub enum FrameOutcome<T = PoseWithCovariance> {
         /// Its rival.
         rival: FrameConsensus<T>,
     },
-    /// What agrees does not give the frames' scale: no alignment measures it, and the baseline between them is too short
-    /// for the scale.
+    /// What agrees does not give the frames' scale: no alignment measures it, and the baseline between them is too
+    /// short for the scale.
     BaselineTooShort {
         /// Standard deviation of log-scale that the baselines support.
         log_scale_sigma: f64,
@@ -113,8 +113,8 @@ pub struct FrameConsensus<T = PoseWithCovariance> {
     pub t_alpha_beta: T,
     /// The alignments used, as ascending positions in the caller's slice.
     pub used: Vec<usize>,
-    /// Factor on standard deviations that the residuals ask for: 1 unless they are larger than chance explains, at most the
-    /// configured largest.
+    /// Factor on standard deviations that the residuals ask for: 1 unless they are larger than chance explains, at most
+    /// the configured largest.
     pub covariance_scale: f64,
     /// Log₁₀ of the number of false alarms.
     pub log10_nfa: f64,

@@ -48,7 +48,8 @@ fn hostile_facts_are_listed_and_do_no_harm() {
     assert!(reasons[5].is_some());
     assert_eq!(reason(copy), Some(Unused::RepeatsPair(again.entry)));
     assert_eq!(reason(flipped), Some(Unused::RepeatsPair(again.entry)));
-    // A pair's number of false alarms grows with what was told of it; so the spanning forest, hence the start, may differ.
+    // A pair's number of false alarms grows with what was told of it; so the spanning forest, hence the start, may
+    // differ.
     assert!((map.chi2 / want.chi2 - 1.0).abs() < 1e-12, "{} {}", map.chi2, want.chi2);
     assert!(map.edges().iter().filter_map(|e| e.unused).all(|u| !u.to_string().is_empty()));
 }

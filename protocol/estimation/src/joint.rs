@@ -1,11 +1,11 @@
-//! The map as a pure function of the set of facts: decides which frames merge, which measurements count, and where every
-//! anchor lies (DESIGN §7, MATH §3 and §5).
+//! The map as a pure function of the set of facts: decides which frames merge, which measurements count, and where
+//! every anchor lies (DESIGN §7, MATH §3 and §5).
 //!
 //! 1. `admission` sorts the facts canonically and lists what cannot be used.
 //! 2. `pairs` runs the frame-level consensus on each pair of frames and accepts merges along the strongest spanning
 //!    forest; a pair that contradicts a loop of frames (χ², 99.99 %) is left out.
-//! 3. Here, the whole graph is solved with the alignments that remain (`distortion` knows what they have in common); one whose leave-one-out χ² exceeds 99.9 % is
-//!    dropped, the largest first, and the graph solved again.
+//! 3. Here, the whole graph is solved with the alignments that remain (`distortion` knows what they have in common);
+//!    one whose leave-one-out χ² exceeds 99.9 % is dropped, the largest first, and the graph solved again.
 //! 4. Sightings between merged frames, and alignments that no consensus weighed, join if they agree with that map.
 
 use super::admission::{Admission, Kind};
@@ -30,8 +30,8 @@ use thiserror::Error;
 /// Rounds in which the map lets in what agrees with it: each makes it surer of the next.
 const ADMISSIONS_MAX: usize = 4;
 
-/// Bytes that a component of the map may take while it is solved: what robots have, and half of what a graph of one's own
-/// may take. Whoever sends a map that takes more has his frame left out.
+/// Bytes that a component of the map may take while it is solved: what robots have, and half of what a graph of one's
+/// own may take. Whoever sends a map that takes more has his frame left out.
 pub const MAP_BYTES_MAX: u64 = 2 << 30;
 
 /// A frame's own trajectory of anchors.
@@ -67,20 +67,21 @@ pub struct MapProblem {
     pub sightings: Vec<AgreedAlignment>,
     /// Where other robots were seen, not how they were turned.
     pub positions: Vec<StatedPoint>,
-    /// Alignments whose errors are not their own: which share of the variance each other alignment of the one submap has
-    /// in common with it, and as much of the other; 0 to 0.45 ([`COMMON_MAX`](super::distortion::COMMON_MAX)), 0 for what
-    /// is not listed.
+    /// Alignments whose errors are not their own: which share of the variance each other alignment of the one submap
+    /// has in common with it, and as much of the other; 0 to 0.45 ([`COMMON_MAX`](super::distortion::COMMON_MAX)), 0
+    /// for what is not listed.
     pub common: BTreeMap<EntryId, f64>,
     /// How many keyframes made a submap, by its place in the chain; of what is not listed nobody knows.
     pub keyframes: BTreeMap<SubmapId, NonZero<u16>>,
-    /// How many submaps are gone from the chain before one, the steps of which are compounded in that to it; none if it is
-    /// not listed.
+    /// How many submaps are gone from the chain before one, the steps of which are compounded in that to it; none if it
+    /// is not listed.
     pub gone: BTreeMap<SubmapId, u32>,
-    /// Between two frames, `a < b`: pairs of submaps of which one end found an alignment, and the other end that there are
-    /// several. Within one, `a = b`: pairs of its owner's that fit in several ways. Places that repeat themselves show by it.
+    /// Between two frames, `a < b`: pairs of submaps of which one end found an alignment, and the other end that there
+    /// are several. Within one, `a = b`: pairs of its owner's that fit in several ways. Places that repeat themselves
+    /// show by it.
     pub ambiguous: BTreeMap<(FrameId, FrameId), usize>,
-    /// Alignments that were looked for because a map had their submaps overlap: they speak for no map, and count once one
-    /// without them agrees with them.
+    /// Alignments that were looked for because a map had their submaps overlap: they speak for no map, and count once
+    /// one without them agrees with them.
     pub second_looks: BTreeSet<EntryId>,
 }
 
@@ -114,7 +115,8 @@ pub enum Unused {
     /// Its two frames are not merged.
     #[error("its frames are not merged ({0:?})")]
     Unmerged(PairStatus),
-    /// Its pair has more alignments than its consensus weighs, or a map called for it; it counts once the map agrees with it.
+    /// Its pair has more alignments than its consensus weighs, or a map called for it; it counts once the map agrees
+    /// with it.
     #[error("waits for a map that tells where its frames lie")]
     Waiting,
     /// The frame-level consensus of its pair leaves it out.

@@ -1,8 +1,8 @@
 //! Several anchors at once: their joint covariance, and the relations of many pairs of them.
 //!
 //! Of each anchor `L⁻¹ E` is kept, E the columns of its own perturbation: it is zero off the way from the anchor to the
-//! root of the factor. Every covariance is an inner product of differences of these, as in [`super::marginals`], so that
-//! nothing is ever the small difference of large variances.
+//! root of the factor. Every covariance is an inner product of differences of these, as in [`super::marginals`], so
+//! that nothing is ever the small difference of large variances.
 //!
 //! Perturbations are local (on the right): `T ⊕ δ = T Exp(δ)`, `δ = (ρ, φ)` of a rigid pose and `(ρ, φ, λ)` of a
 //! similarity, translation first, lengths in the units of the anchor's frame.
@@ -71,8 +71,8 @@ impl JointPoses {
         self.rows.get(k).cloned()
     }
 
-    /// The covariance of the local perturbations of all [`JointPoses::poses`], one after the other; symmetric. The rows of
-    /// the reference itself, if it is among the anchors, are zero.
+    /// The covariance of the local perturbations of all [`JointPoses::poses`], one after the other; symmetric. The rows
+    /// of the reference itself, if it is among the anchors, are zero.
     pub fn covariance(&self) -> &DMatrix<f64> {
         &self.covariance
     }
@@ -109,8 +109,8 @@ impl JointPoses {
 }
 
 impl Solution {
-    /// `t_reference_anchor` of several anchors of the component with their joint covariance. Frames in `unknown_scale` as
-    /// in [`Solution::relative`].
+    /// `t_reference_anchor` of several anchors of the component with their joint covariance. Frames in `unknown_scale`
+    /// as in [`Solution::relative`].
     ///
     /// # Errors
     /// [`JointError`].

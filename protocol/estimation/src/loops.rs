@@ -2,7 +2,8 @@
 //!
 //! A closure must agree with the odometry between its ends (χ², 99.9 %), and pairs of closures with each other through
 //! the odometry that joins their ends (pairwise consistency, Mangelson et al. 2018, with odometry segments taken as
-//! independent; of many, each with a fixed number of others, so that the cost grows with their number). Of closures that contradict each other, the one with the most contradictions goes first.
+//! independent; of many, each with a fixed number of others, so that the cost grows with their number). Of closures
+//! that contradict each other, the one with the most contradictions goes first.
 
 use super::admission::{Admission, Kind};
 use super::joint::Unused;
@@ -32,8 +33,8 @@ struct Closure {
 }
 
 impl Closure {
-    /// Whether it is off from the odometry by so much of the way between its ends that it closes no loop: it took one place
-    /// for another. `driven` are the distances to each anchor, m.
+    /// Whether it is off from the odometry by so much of the way between its ends that it closes no loop: it took one
+    /// place for another. `driven` are the distances to each anchor, m.
     fn is_elsewhere(&self, t_i_j: &Se3, driven: &[f64]) -> bool {
         let way = driven.get(self.i).zip(driven.get(self.j)).map_or(f64::INFINITY, |(from, to)| to - from);
         let off = (self.t_i_j.pose.translation - t_i_j.translation).norm();
@@ -170,8 +171,8 @@ mod tests {
     use rand::Rng;
     use std::collections::BTreeSet;
 
-    /// Far more closures than are compared with one another, every tenth false, each in its own way, by no more than the
-    /// odometry allows.
+    /// Far more closures than are compared with one another, every tenth false, each in its own way, by no more than
+    /// the odometry allows.
     #[test]
     fn the_false_ones_of_many_are_left_out_and_no_others() {
         let mut rng = rng(77);

@@ -84,7 +84,8 @@ impl Solution {
         Some(WithCloud { solution: self, a, columns: self.columns_of(&self.cloud_rows(a)?)? })
     }
 
-    /// The row block of what the factor of an anchor's cloud is off by: that of the cloud, and of the steps that it follows.
+    /// The row block of what the factor of an anchor's cloud is off by: that of the cloud, and of the steps that it
+    /// follows.
     fn cloud_rows(&self, anchor: usize) -> Option<Vec<(usize, Vector7)>> {
         let (place, cloud) = self.graph.cloud_of(anchor)?;
         let of = |edge: &Edge| {
@@ -113,7 +114,8 @@ impl Solution {
         HalfSolved { columns, touched, n: self.pattern.scalars() }
     }
 
-    /// [`Solution::covariance_between`] for two anchors that a factor ties, from the selected inverse instead of solves.
+    /// [`Solution::covariance_between`] for two anchors that a factor ties, from the selected inverse instead of
+    /// solves.
     pub(super) fn covariance_along(&self, inverse: &SelectedInverse<'_>, a: usize, b: usize) -> Option<Matrix7> {
         let adjoint = (self.values[b].inverse() * self.values[a]).adjoint();
         let block = |x: usize, y: usize| {

@@ -16,8 +16,8 @@ const DAMPING_FIRST: f64 = 1e-4;
 const DAMPING_MIN: f64 = 1e-8;
 /// A step that keeps less than this share of what it promises was too long.
 const GAIN_POOR: f64 = 0.25;
-/// One that keeps this share shows that the model holds: the next step is tried undamped. Damping that fades by Nielsen's
-/// third at a time leaves a graph's weakest directions, the slow bends of long chains, to a dozen steps.
+/// One that keeps this share shows that the model holds: the next step is tried undamped. Damping that fades by
+/// Nielsen's third at a time leaves a graph's weakest directions, the slow bends of long chains, to a dozen steps.
 const GAIN_GOOD: f64 = 0.9;
 /// The next step may promise so many times what the worse of the last two shares says of it.
 const TAIL_MARGIN: f64 = 10.0;

@@ -1,12 +1,13 @@
-//! What a cloud owes to the odometry on either side of its anchor. Of the error d of where the cloud lies by its anchor, a
-//! part is told by what the steps to and from the anchor are off by, which bent it ([`walk`](super::drift_model)): with `r_k` and
-//! `r_{k+1}` the residuals of these steps and Σ their covariances, the cloud's factor is that of
-//! `d − Cov(d, r_k) Σ_k⁻¹ r_k − Cov(d, r_{k+1}) Σ_{k+1}⁻¹ r_{k+1}`, of what is then left of d's covariance: a factor of four
-//! nodes. What neighbouring clouds still have in common, by the step between them, is left out.
+//! What a cloud owes to the odometry on either side of its anchor. Of the error d of where the cloud lies by its
+//! anchor, a part is told by what the steps to and from the anchor are off by, which bent it
+//! ([`walk`](super::drift_model)): with `r_k` and `r_{k+1}` the residuals of these steps and Σ their covariances, the
+//! cloud's factor is that of `d − Cov(d, r_k) Σ_k⁻¹ r_k − Cov(d, r_{k+1}) Σ_{k+1}⁻¹ r_{k+1}`, of what is then left of
+//! d's covariance: a factor of four nodes. What neighbouring clouds still have in common, by the step between them, is
+//! left out.
 //!
-//! *Worked out* for one axis of a chain of twelve submaps of four keyframes, each aligned one to four times with what is known,
-//! of 0.2, 1 and 4 times the walk's variance: anchors amid the chain have 1.02, 1.01 and 1.00 of the variance that they
-//! claim. Without it they have 1.27, 1.13 and 1.04, and 6, 2 and 1 % more than with it.
+//! *Worked out* for one axis of a chain of twelve submaps of four keyframes, each aligned one to four times with what
+//! is known, of 0.2, 1 and 4 times the walk's variance: anchors amid the chain have 1.02, 1.01 and 1.00 of the variance
+//! that they claim. Without it they have 1.27, 1.13 and 1.04, and 6, 2 and 1 % more than with it.
 
 use super::drift_model::{DriftModel, Stretch};
 use super::graph::{Edge, Graph, Label};

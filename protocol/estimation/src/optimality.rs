@@ -1,5 +1,5 @@
-//! Whether a joint estimate lies at the global optimum, as far as that can be proved: for graphs with isotropic weights,
-//! by the dual certificate ([`super::certificate`]) of the minimum of SE-Sync's cost next to the estimate.
+//! Whether a joint estimate lies at the global optimum, as far as that can be proved: for graphs with isotropic
+//! weights, by the dual certificate ([`super::certificate`]) of the minimum of SE-Sync's cost next to the estimate.
 
 use super::chordal::{ChordalEdge, ChordalGraph};
 use super::graph::Factor;

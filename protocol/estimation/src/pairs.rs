@@ -21,12 +21,13 @@ use std::collections::{BTreeMap, BTreeSet};
 /// cost the cube of their number; the others wait for the map, which tells the good ones better than a pair could.
 const WEIGHED_MAX: usize = 32;
 
-/// With so many pairs of submaps ambiguous for each alignment that is used, the frames are. Measured in simulated halls: where
-/// every shelf is the same, false merges had 1 to 2.3; elsewhere LiDARs have up to 0.2 and landmarks up to 0.7.
+/// With so many pairs of submaps ambiguous for each alignment that is used, the frames are. Measured in simulated
+/// halls: where every shelf is the same, false merges had 1 to 2.3; elsewhere LiDARs have up to 0.2 and landmarks up to
+/// 0.7.
 const AMBIGUOUS_SHARE: f64 = 0.8;
 
-/// Loop closures of one frame that its odometry refutes, or that fit at another place as well, from which on they tell of a place
-/// that repeats itself: fewer may be chance.
+/// Loop closures of one frame that its odometry refutes, or that fit at another place as well, from which on they tell
+/// of a place that repeats itself: fewer may be chance.
 const REPEATED_MIN: usize = 2;
 
 /// A pair of frames, `a < b`, and what its own alignments say.
@@ -94,10 +95,11 @@ pub(super) fn consensus(admission: &mut Admission, config: &EstimateConfig) -> V
     pairs
 }
 
-/// Frames in which about as many places look like others, as was told (`ambiguous`) or as their odometry tells, as were seen
-/// again: what looks the same there is not. *Measured*, simulated LiDARs: of the loops that were looked at, ambiguous or refuted
-/// 19 of 19 in rows of equal rooms and 16 of 18 in rows of equal shelves (a seed each); ambiguous 0 of 418 in a furnished hall,
-/// 0 to 3 of 50 to 60 in halls of cells that are not quite alike, and a fifth along streets, where all merge.
+/// Frames in which about as many places look like others, as was told (`ambiguous`) or as their odometry tells, as were
+/// seen again: what looks the same there is not. *Measured*, simulated LiDARs: of the loops that were looked at,
+/// ambiguous or refuted 19 of 19 in rows of equal rooms and 16 of 18 in rows of equal shelves (a seed each); ambiguous
+/// 0 of 418 in a furnished hall, 0 to 3 of 50 to 60 in halls of cells that are not quite alike, and a fifth along
+/// streets, where all merge.
 fn repeating(loops: &BTreeMap<FrameId, Loops>, ambiguous: &BTreeMap<(FrameId, FrameId), usize>) -> BTreeSet<FrameId> {
     let repeats = |frame: &FrameId| {
         let Loops { held, refuted } = loops.get(frame).copied().unwrap_or_default();
@@ -108,9 +110,9 @@ fn repeating(loops: &BTreeMap<FrameId, Loops>, ambiguous: &BTreeMap<(FrameId, Fr
     loops.keys().copied().chain(within).filter(repeats).collect()
 }
 
-/// `t_world_anchor` of every anchor: odometry, laid out along the spanning forest. Where a tree holds a frame in metres the
-/// world is in metres, and so are all such frames, also those reached through one of unknown scale: what the way there
-/// says of a scale is not exact, and no later step could put it right.
+/// `t_world_anchor` of every anchor: odometry, laid out along the spanning forest. Where a tree holds a frame in metres
+/// the world is in metres, and so are all such frames, also those reached through one of unknown scale: what the way
+/// there says of a scale is not exact, and no later step could put it right.
 pub(super) fn start(admission: &Admission, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3> {
     let forest = Forest::of(pairs);
     let mut world: BTreeMap<FrameId, Sim3> = BTreeMap::new();
@@ -300,8 +302,8 @@ fn decide(admission: &Admission, (a, b): (FrameId, FrameId), members: &[usize], 
 }
 
 impl Outcome {
-    /// Not merged, where `ambiguous` pairs of submaps tell that the place repeats itself: about as many as alignments are
-    /// used, of all `members` that were weighed or wait.
+    /// Not merged, where `ambiguous` pairs of submaps tell that the place repeats itself: about as many as alignments
+    /// are used, of all `members` that were weighed or wait.
     fn unless_ambiguous(self, ambiguous: usize, members: usize) -> Self {
         let waiting = members.saturating_sub(WEIGHED_MAX);
         let speak_for_it = (self.used.len() + waiting) as f64;

@@ -53,8 +53,8 @@ fn a_frame_that_takes_its_places_for_others_merges_with_none() {
     let mut world = World::new(rng, 3, 12, false);
     world.align_all(rng, 5, false);
     let (merged, ambiguous) = ((PairStatus::Merged, 5), (PairStatus::Ambiguous, 0));
-    // Closures of the first frame: as found at the same place, though the way between is long; true; and off by a share of
-    // the way, as where odometry is worse than it says.
+    // Closures of the first frame: as found at the same place, though the way between is long; true; and off by a share
+    // of the way, as where odometry is worse than it says.
     let status_of = |told: usize, elsewhere: usize, held: usize, drifted: usize, again: bool| {
         let ambiguous = BTreeMap::from([((frame(0), frame(0)), told)]);
         let mut problem = MapProblem { ambiguous, ..world.problem.clone() };
@@ -130,7 +130,8 @@ fn second_looks_merge_nothing_and_count_once_others_have() {
     assert_eq!((used(&of_two, 0, 1), used(&of_two, 0, 2), used(&of_two, 1, 2)), (0, 0, 4));
 }
 
-/// A map that let in what merges nothing, second looks and too few first ones, falls apart as if there were none of these.
+/// A map that let in what merges nothing, second looks and too few first ones, falls apart as if there were none of
+/// these.
 #[test]
 fn what_merges_nothing_does_not_hold_together_what_falls_apart() {
     let rng = &mut rng(48);

@@ -1,5 +1,5 @@
-//! Where anchors and origins lie in a frame's own coordinates. A frame's origin hangs on its first anchor alone, and bodies on
-//! their last; what their errors have to do with the map's is told by [`ends`](super::extrapolation).
+//! Where anchors and origins lie in a frame's own coordinates. A frame's origin hangs on its first anchor alone, and
+//! bodies on their last; what their errors have to do with the map's is told by [`ends`](super::extrapolation).
 
 use super::distortion;
 use super::drift_model::DriftModel;
@@ -68,8 +68,8 @@ impl JointEstimate {
         together.filter_map(end).collect()
     }
 
-    /// How a frame's origin lies by its first anchor, as seen from where `off_together` says: by the covariance of how that
-    /// anchor lies from there with what its cloud is off by.
+    /// How a frame's origin lies by its first anchor, as seen from where `off_together` says: by the covariance of how
+    /// that anchor lies from there with what its cloud is off by.
     fn start(&self, frame: FrameId, off_together: impl FnOnce(&Solution) -> Option<Matrix6<f64>>) -> Option<End> {
         let [(first, walk), _] = self.ends.get(&frame)?;
         End::of(self.solution_of(frame, frame)?, *first, walk.before_anchor()?, off_together)

@@ -1,9 +1,9 @@
 //! Where something was seen, not how it is turned: a range and a bearing to another robot.
 //!
-//! The measurement is a point of `j`, of known place `p_j` in its anchor's frame, seen at `p_i` in that of `i`:
-//! `p_i = t_i_j p_j + e`. The graph's measurements are whole poses, so it is completed to one once there is a map that
-//! says how `j` is turned: that rotation, about the point, with a standard deviation of [`TURN_SIGMA`]. What the map is
-//! told again of itself is its own information times (σ / 2.5 rad)², which is 2e-5 for a σ of 0.6° and 0.5 % for 10°. In the
+//! The measurement is a point of `j`, of known place `p_j` in its anchor's frame, seen at `p_i` in that of `i`: `p_i =
+//! t_i_j p_j + e`. The graph's measurements are whole poses, so it is completed to one once there is a map that says
+//! how `j` is turned: that rotation, about the point, with a standard deviation of [`TURN_SIGMA`]. What the map is told
+//! again of itself is its own information times (σ / 2.5 rad)², which is 2e-5 for a σ of 0.6° and 0.5 % for 10°. In the
 //! other three directions this is the measurement, to first order in what the rotation is off.
 
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, So3};

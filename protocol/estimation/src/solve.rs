@@ -191,8 +191,8 @@ struct System<'a> {
 enum Terms {
     /// Between anchors of fixed unit.
     Rigid(Rigid),
-    /// A cloud's that follows its odometry: first scalar of each node, none of the one held fixed, and the slots of the pairs
-    /// (p, q), p ≤ q, of those that have one, row by row.
+    /// A cloud's that follows its odometry: first scalar of each node, none of the one held fixed, and the slots of the
+    /// pairs (p, q), p ≤ q, of those that have one, row by row.
     Bent { starts: Vec<Option<usize>>, slots: Vec<Slot> },
     /// All others: first scalar and part of each variable, and the slots of the pairs (p, q), p ≤ q, row by row.
     General { parts: Vec<(usize, Part)>, slots: Vec<Slot> },
@@ -295,8 +295,8 @@ pub(super) struct RigidTerm {
 }
 
 impl RigidTerm {
-    /// With `J_i = −J_j A`, `A = Ad((X_i⁻¹ X_j)⁻¹)`: `H_jj = J_jᵀ W J_j`, `H_ji = −H_jj A`, `H_ii = −Aᵀ H_ji`. `J_j` and
-    /// `A` are both `[d u; 0 d]` in blocks of translation and rotation, which spares a third of the products.
+    /// With `J_i = −J_j A`, `A = Ad((X_i⁻¹ X_j)⁻¹)`: `H_jj = J_jᵀ W J_j`, `H_ji = −H_jj A`, `H_ii = −Aᵀ H_ji`. `J_j`
+    /// and `A` are both `[d u; 0 d]` in blocks of translation and rotation, which spares a third of the products.
     pub(super) fn new(edge: &Edge, values: &[Sim3]) -> Self {
         let (residual, by_j, adjoint) = edge.linearise_rigid(values);
         let (d, u) = (block(&by_j, 0, 0), block(&by_j, 0, 3));

@@ -12,7 +12,8 @@ use std::collections::BTreeMap;
 /// Robots that drove, and told how many keyframes made each submap, but not yet what they saw of one another.
 pub(crate) struct Walked {
     pub(crate) world: World,
-    /// Where each anchor would be if its submap's keyframes lay by it as the odometry says: `t_world_anchor` of the cloud.
+    /// Where each anchor would be if its submap's keyframes lay by it as the odometry says: `t_world_anchor` of the
+    /// cloud.
     pub(crate) clouds: BTreeMap<SubmapId, Se3>,
     /// The last of each robot.
     pub(crate) bodies: Vec<Body>,
@@ -84,8 +85,8 @@ fn walk(
     (clouds, Body { t_anchor_body: PoseWithCovariance { pose: onward(), covariance }, t_world_body })
 }
 
-/// Odometry on one side of an anchor, seen from there: what it is off by as a whole, and the sum of what the keyframes on
-/// the way are off by.
+/// Odometry on one side of an anchor, seen from there: what it is off by as a whole, and the sum of what the keyframes
+/// on the way are off by.
 fn one_side(rng: &mut ChaCha8Rng, steps: u16, step: &Covariance<6>) -> [Vector6<f64>; 2] {
     let (mut off, mut sum) = (Vector6::zeros(), Vector6::zeros());
     for _ in 0..steps {

@@ -57,7 +57,8 @@ impl<const N: usize> Covariance<N> {
         Ok(Self(sym))
     }
 
-    /// The covariance `m`, or where rounding or range made `m` none, a diagonal one that bounds it: N·diag(m), in range.
+    /// The covariance `m`, or where rounding or range made `m` none, a diagonal one that bounds it: N·diag(m), in
+    /// range.
     ///
     /// N·diag(P) − P is positive semidefinite for every covariance P (Cauchy–Schwarz).
     #[must_use]

@@ -37,7 +37,8 @@ const OMEGA_STEPS: usize = 4;
 const STEPS_MAX: usize = 50;
 /// A step smaller than this many standard deviations, squared, is none.
 const STEP_MIN: f64 = 1e-20;
-/// Two slopes that differ by so small a share cancel: rounding is not to choose between estimates that are equally sure.
+/// Two slopes that differ by so small a share cancel: rounding is not to choose between estimates that are equally
+/// sure.
 const SLOPE_SLACK: f64 = 1e-12;
 /// A part of a covariance may be so much below zero by rounding, relative to the whole.
 const SLACK: f64 = 1e-9;

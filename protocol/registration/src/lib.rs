@@ -1,5 +1,5 @@
-//! Where two submaps lie by one another: keyframes become submaps ([`submap`]), submaps become features, and matched features
-//! become an alignment with an honest covariance, or a refusal ([`align`]: σ-consensus).
+//! Where two submaps lie by one another: keyframes become submaps ([`submap`]), submaps become features, and matched
+//! features become an alignment with an honest covariance, or a refusal ([`align`]: σ-consensus).
 
 pub mod align;
 mod simd;

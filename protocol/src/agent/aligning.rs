@@ -345,8 +345,8 @@ impl Agent {
         }
     }
 
-    /// Of two of our own submaps, one fits at another place as well: all are told so, once of either, so that no single bare
-    /// submap speaks for a whole frame. Of submaps of another epoch nothing is told.
+    /// Of two of our own submaps, one fits at another place as well: all are told so, once of either, so that no single
+    /// bare submap speaks for a whole frame. Of submaps of another epoch nothing is told.
     fn note_lookalike(&mut self, work: &Work, why: NotAligned) {
         let ((i, j), frame) = (pair_of(work.mine, work.theirs), self.me.frame);
         // Second looks speak for no merge, and against none.

@@ -1,7 +1,7 @@
-//! What may be spent on knowing better what is known already: frames that have merged are aligned further at a steady cost
-//! in bytes, whatever the gain, so that a robot that drives for hours does not fill its radio. Merging itself need not
-//! wait, but is paid for out of the same budget. Whoever proposes a pair pays, before anything moves, for what both ends
-//! will send.
+//! What may be spent on knowing better what is known already: frames that have merged are aligned further at a steady
+//! cost in bytes, whatever the gain, so that a robot that drives for hours does not fill its radio. Merging itself need
+//! not wait, but is paid for out of the same budget. Whoever proposes a pair pays, before anything moves, for what both
+//! ends will send.
 
 use crate::gossip::Bucket;
 use crate::time::Instant;
@@ -35,8 +35,8 @@ impl Allowance {
         self.bucket.due(now, 0.0) <= now
     }
 
-    /// So many bytes were spent, as [`Allowance::may_spend`] allowed. They are owed in full: one pair may cost more than is
-    /// ever saved up.
+    /// So many bytes were spent, as [`Allowance::may_spend`] allowed. They are owed in full: one pair may cost more
+    /// than is ever saved up.
     pub fn spend(&mut self, now: Instant, bytes: usize) {
         self.bucket.set(now, self.bucket.level(now) - bytes as f64);
     }

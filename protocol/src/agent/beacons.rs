@@ -1,7 +1,8 @@
 //! What other robots' pose beacons tell of when they were where, and how they move.
 //!
-//! A beacon states the keyframe that it tells of, on a clock that nobody else has. Of all beacons of a robot the one that
-//! took the least from the keyframe to us tells how the clocks differ, up to that least time; by it the others were late.
+//! A beacon states the keyframe that it tells of, on a clock that nobody else has. Of all beacons of a robot the one
+//! that took the least from the keyframe to us tells how the clocks differ, up to that least time; by it the others
+//! were late.
 
 use super::sighting::Twist;
 use crate::time::Instant;

@@ -212,15 +212,16 @@ fn the_estimate_of_a_condensed_log_is_honest() {
     for anees in anees {
         assert!((0.93..=1.07).contains(&anees), "{anees}");
     }
-    // Compounding itself is exact (the next test). Here the odometry is linearised where it was measured, and in the whole
-    // graph where the loops move it to; and by how much the odometry of one submap bent its cloud is told by its share of a
-    // compounded step, whose rotations have longer levers: by so much the two differ, to either side.
+    // Compounding itself is exact (the next test). Here the odometry is linearised where it was measured, and in the
+    // whole graph where the loops move it to; and by how much the odometry of one submap bent its cloud is told by its
+    // share of a compounded step, whose rotations have longer levers: by so much the two differ, to either side.
     assert!(ratios[0] > 0.999 && least > 0.98, "surer than before: {}, {least}", ratios[0]);
     assert!(shifts[shifts.len() - 1] < 0.3, "{}", shifts[shifts.len() - 1]);
 }
 
 /// Where the measurements agree, so that whole and condensed graph are linearised at one place, no direction of any
-/// relation is surer than before, where no cloud is bent, but for the floor that the graph puts below every factor (1.2e-8), and for rounding.
+/// relation is surer than before, where no cloud is bent, but for the floor that the graph puts below every factor
+/// (1.2e-8), and for rounding.
 #[test]
 fn a_condensed_log_is_never_surer_than_what_it_replaces() {
     let (mut compounded, mut written) = ([f64::INFINITY, 0.0], [f64::INFINITY, 0.0f64]);

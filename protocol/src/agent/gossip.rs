@@ -151,8 +151,8 @@ impl Agent {
         }
     }
 
-    /// A keyframe is told of at once, if the last beacon went out `pose_secs` ago: late news would be taken for a place where
-    /// we no longer are. Without a new one the beacon is repeated, less often, for who missed it.
+    /// A keyframe is told of at once, if the last beacon went out `pose_secs` ago: late news would be taken for a place
+    /// where we no longer are. Without a new one the beacon is repeated, less often, for who missed it.
     fn pose_due(&self) -> Instant {
         let (at, told) = self.gossip.posed;
         let pauses = if self.stamp() == told { REPEAT_PAUSES } else { 1.0 };

@@ -229,8 +229,8 @@ pub enum Record {
         /// The last one closed.
         epoch: u32,
     },
-    /// What our front end calls the run that made the keyframes of this epoch: after a restart, one of another run is of
-    /// another frame. One is kept, of the largest epoch.
+    /// What our front end calls the run that made the keyframes of this epoch: after a restart, one of another run is
+    /// of another frame. One is kept, of the largest epoch.
     Session {
         /// Our epoch.
         epoch: u32,
@@ -239,8 +239,8 @@ pub enum Record {
         /// The last ones that are over, at most [`SESSIONS_OVER_MAX`](crate::submap::runs::SESSIONS_OVER_MAX).
         over: Vec<u64>,
     },
-    /// We tried a pair of submaps and could not align it: not to be tried again on the same evidence. Nothing waits for it
-    /// to be durable, since a lost one costs no more than the try.
+    /// We tried a pair of submaps and could not align it: not to be tried again on the same evidence. Nothing waits for
+    /// it to be durable, since a lost one costs no more than the try.
     Refused {
         /// Target.
         i: SubmapId,
@@ -335,8 +335,8 @@ pub enum Event {
         /// Refusals of the same peer not reported one by one.
         suppressed: u64,
     },
-    /// Nothing of our own can be written: storage failed, and until it works again the agent hears, solves and serves what
-    /// is durable, and no more; or we began more epochs than others take, and only a new key helps.
+    /// Nothing of our own can be written: storage failed, and until it works again the agent hears, solves and serves
+    /// what is durable, and no more; or we began more epochs than others take, and only a new key helps.
     ReceiveOnly {
         /// Why.
         reason: String,

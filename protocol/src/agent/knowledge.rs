@@ -262,7 +262,8 @@ impl Knowledge {
         all.iter().find(|(verdict, _)| verdict.frame.robot == other).map(|(_, fact)| fact)
     }
 
-    /// The measurement that enters the estimate for an agreed alignment: midway between what the two endpoints measured.
+    /// The measurement that enters the estimate for an agreed alignment: midway between what the two endpoints
+    /// measured.
     fn measurement(&self, id: EntryId, fact: &AlignmentFact) -> Relative {
         let Some(VerdictOutcome::Measured { t_i_j, .. }) = self.verdict(id, fact).map(|v| &v.outcome) else {
             return fact.t_i_j;
@@ -344,8 +345,8 @@ impl Knowledge {
         }
     }
 
-    /// Between which frames there are pairs of submaps of which one end found an alignment, and the other that there are
-    /// several; how many. Of a frame and itself, pairs that fit in several ways by their owner's word.
+    /// Between which frames there are pairs of submaps of which one end found an alignment, and the other that there
+    /// are several; how many. Of a frame and itself, pairs that fit in several ways by their owner's word.
     fn ambiguous(&self) -> BTreeMap<(FrameId, FrameId), usize> {
         let is_ambiguous = |id: &EntryId| {
             let first_look = self.alignments.get(id).filter(|fact| !self.is_second_look(fact));
@@ -371,8 +372,8 @@ impl Knowledge {
         told.map(|(_, pair)| (pair.i, pair.j)).collect()
     }
 
-    /// Of all alignments of two submaps the one that counts: the first that both endpoints agree on, of first looks if there
-    /// is one.
+    /// Of all alignments of two submaps the one that counts: the first that both endpoints agree on, of first looks if
+    /// there is one.
     pub fn counted(&self, pair: Pair) -> Option<EntryId> {
         let agreed =
             || self.by_pair.get(&pair).into_iter().flatten().filter(|id| self.agreement(**id) == Agreement::Agreed);

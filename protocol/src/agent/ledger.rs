@@ -1,5 +1,5 @@
-//! What this robot keeps: facts of its own and of others on their way to the disk, where they take effect, and the epochs
-//! that its own are written in. While it cannot write, it is receive-only.
+//! What this robot keeps: facts of its own and of others on their way to the disk, where they take effect, and the
+//! epochs that its own are written in. While it cannot write, it is receive-only.
 
 use super::Agent;
 use super::io::{EpochReason, Event, Output, Record};
@@ -9,8 +9,8 @@ use crate::wire::EntryBytes;
 use crate::wire::fact::Fact;
 use std::collections::BTreeMap;
 
-/// Batches on their way to the disk beyond which facts of others and sightings are refused: the disk is too slow for them.
-/// What must be kept is bounded by itself: submaps by their queue, answers by their list.
+/// Batches on their way to the disk beyond which facts of others and sightings are refused: the disk is too slow for
+/// them. What must be kept is bounded by itself: submaps by their queue, answers by their list.
 pub const BATCHES_WAITING_MAX: usize = 1_024;
 
 /// Records on their way to the disk.
@@ -121,8 +121,8 @@ impl Agent {
         }
     }
 
-    /// The same of a past that we cannot hold, because it has two histories or its beginning is yet to come: what we write
-    /// before the end of it would be refused.
+    /// The same of a past that we cannot hold, because it has two histories or its beginning is yet to come: what we
+    /// write before the end of it would be refused.
     fn meet_own_end(&mut self, frame: FrameId) {
         if frame.epoch >= self.me.frame.epoch {
             self.meet_own_past(frame);

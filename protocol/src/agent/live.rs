@@ -1,10 +1,11 @@
-//! How live robots lie by one another: decides which relations are drawn from the joint estimate before its factorisation
-//! goes, and what is told of pairs of robots.
+//! How live robots lie by one another: decides which relations are drawn from the joint estimate before its
+//! factorisation goes, and what is told of pairs of robots.
 //!
 //! A robot is where its anchor is, by the estimate, and by that anchor where its beacon says. The anchors of two robots
-//! are correlated, as whatever ties both of them to a third moves both alike: so their relation is asked of the estimate
-//! itself, and never made of two poses in our frame (MATH §3). The beacons are independent of one another; in relations of
-//! two robots they are taken to be so of the estimate too, which is cautious ([`ends`](crate::estimate::extrapolation)).
+//! are correlated, as whatever ties both of them to a third moves both alike: so their relation is asked of the
+//! estimate itself, and never made of two poses in our frame (MATH §3). The beacons are independent of one another; in
+//! relations of two robots they are taken to be so of the estimate too, which is cautious
+//! ([`ends`](crate::estimate::extrapolation)).
 
 use super::Agent;
 use super::knowledge::Gaps;
@@ -105,8 +106,8 @@ fn place(gaps: &Gaps, id: SubmapId) -> Option<u32> {
     }
 }
 
-/// Pairs of anchors of different robots: of all robots, or, of more than [`ROBOTS_ALL_PAIRS_MAX`], with the first if it is
-/// ours.
+/// Pairs of anchors of different robots: of all robots, or, of more than [`ROBOTS_ALL_PAIRS_MAX`], with the first if it
+/// is ours.
 fn pairs_among(robots: &[Vec<SubmapId>], is_ours_first: bool) -> Vec<(SubmapId, SubmapId)> {
     let firsts = match robots.len() {
         0..=ROBOTS_ALL_PAIRS_MAX => robots.len(),

@@ -32,8 +32,8 @@ fn a_chain_with_gaps_is_counted_by_its_places() {
     assert_eq!(solved.with_indices(&gaps).live.into_keys().next(), Some((submap(1, 4), submap(2, 5))));
 }
 
-/// Of two robots that are far from ours and see one another, the relation is known far better than two poses in our frame
-/// tell, and its covariance is true.
+/// Of two robots that are far from ours and see one another, the relation is known far better than two poses in our
+/// frame tell, and its covariance is true.
 #[test]
 fn anees_of_live_pairs_lies_in_the_band() {
     let (runs, mut sum, mut surer) = (150, 0.0, 0.0);

@@ -1,7 +1,7 @@
 //! The state machine of one robot: facts, gossip, negotiation and the joint estimate behind one `Input`/`Output` door.
 //!
-//! The contract (tested in `tests/agents/contract.rs`): call [`Agent::handle`] once, drain [`Agent::poll_output`] until it is empty,
-//! then wait until [`Agent::poll_timeout`] or the next input. Only `handle` changes anything.
+//! The contract (tested in `tests/agents/contract.rs`): call [`Agent::handle`] once, drain [`Agent::poll_output`] until
+//! it is empty, then wait until [`Agent::poll_timeout`] or the next input. Only `handle` changes anything.
 //!
 //! Nothing is advertised before it is durable: a new entry goes out as [`Output::Persist`] and takes effect (is
 //! published, counted in the have-vector, used in the estimate) when [`Input::Persisted`] confirms it.
@@ -318,7 +318,8 @@ impl Agent {
         self.resume_mapping(self.runs_of(session));
     }
 
-    /// What is known of the front end's runs, by what was last kept of them: the epoch, its run, and those that are over.
+    /// What is known of the front end's runs, by what was last kept of them: the epoch, its run, and those that are
+    /// over.
     fn runs_of(&self, kept: Option<(u32, u64, Vec<u64>)>) -> Runs {
         let Some((epoch, session, over)) = kept else { return Runs::default() };
         // An epoch that began since may be of any run that is not over.

@@ -1,8 +1,8 @@
 //! Which pairs of submaps are worth aligning, in what order, and who begins (DESIGN §6).
 //!
-//! A hash of the pair decides the responsible endpoint, so exactly one begins. Candidates are ranked by what they promise
-//! for the bytes they cost ([`ranking`](super::ranking)). Pairs that the joint estimate places out of reach of one another,
-//! and submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant. Two frames with
+//! A hash of the pair decides the responsible endpoint, so exactly one begins. Candidates are ranked by what they
+//! promise for the bytes they cost ([`ranking`](super::ranking)). Pairs that the joint estimate places out of reach of
+//! one another, and submaps that have [`ALIGNMENTS_PER_SUBMAP`] with the other frame, stay dormant. Two frames with
 //! [`ALIGNMENTS_PER_FRAME_PAIR`] alignments are tied well enough as such; after that only submaps are aligned that have
 //! drifted from one another by the joint estimate: without these the map of a long drive would become that of its
 //! odometry. Every pair is tried once, and once more with [further keypoints](super::second_look) if it was refused and
@@ -27,8 +27,9 @@ pub const ALIGNMENTS_PER_FRAME_PAIR: usize = 12;
 /// Undisputed alignments of one submap with one other frame beyond which it is tried with no more of that frame's: they
 /// share the submap's errors, so that others tell more.
 pub const ALIGNMENTS_PER_SUBMAP: usize = 3;
-/// The same of its own frame, for LiDARs: these take no keypoints, and their errors average out. *Measured* (four robots in
-/// a hall, two minutes): with 3 the map errs 2.3 times as much as given every true loop, with 4 1.75 times, 5 1.5, 8 1.3.
+/// The same of its own frame, for LiDARs: these take no keypoints, and their errors average out. *Measured* (four
+/// robots in a hall, two minutes): with 3 the map errs 2.3 times as much as given every true loop, with 4 1.75 times, 5
+/// 1.5, 8 1.3.
 pub const LOOPS_PER_SUBMAP: usize = 8;
 /// Pairs tried for one own submap against one foreign frame.
 pub const TRIES_PER_SUBMAP: usize = 12;
@@ -38,8 +39,8 @@ pub const TRIES_PER_SUBMAP_TIED: usize = 3;
 pub const TRIES_PER_SUBMAP_FREE: usize = 8;
 /// Index distance from which two submaps of one frame may close a loop.
 pub const LOOP_GAP: u32 = 5;
-/// Pairs of own submaps of one frame that are told to fit at another place as well: facts of 124 bytes that stay as long as the
-/// frame. If so many do not outweigh the loops that hold, the place does not repeat itself.
+/// Pairs of own submaps of one frame that are told to fit at another place as well: facts of 124 bytes that stay as
+/// long as the frame. If so many do not outweigh the loops that hold, the place does not repeat itself.
 pub const LOOKALIKES_MAX: usize = 32;
 /// Decoded keypoint blobs kept in memory.
 pub const KEYPOINTS_MAX: usize = 512;
@@ -226,8 +227,9 @@ impl Negotiation {
         }
     }
 
-    /// Notes an alignment to answer. Beyond [`VERIFICATIONS_MAX`] those of the robot with most that `waits` go, half of them, the
-    /// latest: whoever states what cannot be answered must not keep others from their answers, nor us busy with making room.
+    /// Notes an alignment to answer. Beyond [`VERIFICATIONS_MAX`] those of the robot with most that `waits` go, half of
+    /// them, the latest: whoever states what cannot be answered must not keep others from their answers, nor us busy
+    /// with making room.
     pub fn add_verification(&mut self, id: EntryId, waits: impl Fn(&EntryId) -> bool) {
         if self.verify.len() >= VERIFICATIONS_MAX {
             let mut waiting: BTreeMap<RobotId, Vec<EntryId>> = BTreeMap::new();

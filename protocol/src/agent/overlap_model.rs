@@ -1,10 +1,10 @@
 //! How probable it is that two submaps can be aligned: what ranks candidates for the bytes and the work they cost.
 //!
-//! What a similarity of summaries is worth depends on the place and the sensor: of pairs of scans alike by 0.92 a
-//! tenth overlapped along two streets, two fifths in a hall, all in one room. So every robot learns it from its own
-//! tries: a logistic regression on the [`OverlapFeatures`] of a pair, Bayesian, one Newton step from the mean for each outcome (the
-//! extended Kalman filter of a Bernoulli variable; Spiegelhalter & Lauritzen 1990), with the predictive probability
-//! of MacKay 1992, `σ(μ / √(1 + π s² / 8))`. It begins from what is usual of a sensor, loosely held.
+//! What a similarity of summaries is worth depends on the place and the sensor: of pairs of scans alike by 0.92 a tenth
+//! overlapped along two streets, two fifths in a hall, all in one room. So every robot learns it from its own tries: a
+//! logistic regression on the [`OverlapFeatures`] of a pair, Bayesian, one Newton step from the mean for each outcome
+//! (the extended Kalman filter of a Bernoulli variable; Spiegelhalter & Lauritzen 1990), with the predictive
+//! probability of MacKay 1992, `σ(μ / √(1 + π s² / 8))`. It begins from what is usual of a sensor, loosely held.
 
 use crate::config::Sensor;
 use crate::submap::{Looks, Similarity};

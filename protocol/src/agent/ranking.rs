@@ -1,5 +1,5 @@
-//! Which pairs of submaps to align next, and which of them may wait: first what joins frames that nothing connects yet, then
-//! where the joint estimate knows least for the bytes it costs to know more.
+//! Which pairs of submaps to align next, and which of them may wait: first what joins frames that nothing connects yet,
+//! then where the joint estimate knows least for the bytes it costs to know more.
 
 use super::Agent;
 use super::allowance::FACT_BYTES;
@@ -12,8 +12,8 @@ use super::stated::Stated;
 use crate::geometry::Relative;
 use crate::ids::SubmapId;
 
-/// Two frames that are tied well enough as such are aligned further where a submap has drifted from the other by this many
-/// standard deviations of an alignment.
+/// Two frames that are tied well enough as such are aligned further where a submap has drifted from the other by this
+/// many standard deviations of an alignment.
 const NEWS_MIN: f64 = 1.0;
 /// The same where no keypoints have to be sent and many alignments of one submap say more than one.
 const NEWS_MIN_FREE: f64 = 0.25;
@@ -22,12 +22,13 @@ const NEWS_MIN_FREE: f64 = 0.25;
 const PROMISE_MIN: f64 = 0.2;
 /// A submap may have drifted from another by so many standard deviations.
 pub(super) const DRIFT_SIGMAS: f64 = 2.0;
-/// Two LiDAR submaps whose anchors are so far apart, in units of what both reach, tell half of what two at one place do.
-/// *Measured* in a hall: errors' variances are 1.2 times at a fifth, 2.4 at three tenths, 4.2 at four tenths.
+/// Two LiDAR submaps whose anchors are so far apart, in units of what both reach, tell half of what two at one place
+/// do. *Measured* in a hall: errors' variances are 1.2 times at a fifth, 2.4 at three tenths, 4.2 at four tenths.
 const TOLD_HALF: f64 = 0.23;
 /// What the other endpoint asked for counts by so much more.
 const WISHED: f64 = 1.5;
-/// Alignments, in units of what it takes to merge, after which two frames that still have not merged may wait with more.
+/// Alignments, in units of what it takes to merge, after which two frames that still have not merged may wait with
+/// more.
 const MERGE_ATTEMPTS: usize = 2;
 
 /// A pair worth trying.
@@ -86,9 +87,9 @@ impl Agent {
         stated
     }
 
-    /// Expected gain of a pair: unmerged frames first, then where the two submaps are alike and least is known of how they
-    /// lie, for as few keypoints as possible; nothing where the joint estimate says that they cannot touch, or where
-    /// another alignment of theirs would say too little.
+    /// Expected gain of a pair: unmerged frames first, then where the two submaps are alike and least is known of how
+    /// they lie, for as few keypoints as possible; nothing where the joint estimate says that they cannot touch, or
+    /// where another alignment of theirs would say too little.
     fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
         let pair = pair_of(candidate.mine, candidate.theirs);
         let is_loop = self.is_loop(candidate.mine, candidate.theirs);
@@ -173,8 +174,8 @@ impl Agent {
     }
 }
 
-/// Share of what an alignment of two LiDAR submaps at one place tells that is told by one of two that are so far apart, in
-/// units of what both reach.
+/// Share of what an alignment of two LiDAR submaps at one place tells that is told by one of two that are so far apart,
+/// in units of what both reach.
 fn told(apart: Option<f64>) -> f64 {
     apart.map_or(1.0, |apart| 1.0 / (1.0 + (apart / TOLD_HALF) * (apart / TOLD_HALF)))
 }
@@ -184,9 +185,9 @@ fn part(of: usize, told: f64) -> usize {
     (of as f64 * told).ceil() as usize
 }
 
-/// How far two anchors are from one another, at the least that is likely: 0 where they may be at one place, 1 where, as far
-/// as one can tell from their reaches, the submaps just touch. `None` where nothing is known of that, for one has drifted
-/// from the other by more than both reach: such a pair must not be passed over, nor count as near.
+/// How far two anchors are from one another, at the least that is likely: 0 where they may be at one place, 1 where, as
+/// far as one can tell from their reaches, the submaps just touch. `None` where nothing is known of that, for one has
+/// drifted from the other by more than both reach: such a pair must not be passed over, nor count as near.
 fn apart((at_a, reach_a): (&Relative, f64), (at_b, reach_b): (&Relative, f64)) -> Option<f64> {
     let apart = (at_a.sim().translation - at_b.sim().translation).norm();
     let reach = at_a.sim().scale * reach_a + at_b.sim().scale * reach_b;
@@ -195,8 +196,9 @@ fn apart((at_a, reach_a): (&Relative, f64), (at_b, reach_b): (&Relative, f64)) -
     (drift <= reach).then_some(if least == 0.0 { 0.0 } else { least / reach })
 }
 
-/// The least that the standard deviation of two anchors' distance vector can be, over all axes, in the unit of the frame that
-/// both are given in: the difference of those of their positions (triangle inequality in L²), whatever they share.
+/// The least that the standard deviation of two anchors' distance vector can be, over all axes, in the unit of the
+/// frame that both are given in: the difference of those of their positions (triangle inequality in L²), whatever they
+/// share.
 fn drift_between(a: &Relative, b: &Relative) -> f64 {
     let sigma = |t: &Relative| t.sim().scale * t.translation_variance().sqrt();
     (sigma(a) - sigma(b)).abs()

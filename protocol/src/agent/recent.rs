@@ -1,5 +1,5 @@
-//! Blobs by their address, of which the oldest go: two that one look takes are fetched one after the other, and must not make
-//! each other go, as the first by address would.
+//! Blobs by their address, of which the oldest go: two that one look takes are fetched one after the other, and must
+//! not make each other go, as the first by address would.
 
 use crate::ids::Hash;
 use std::collections::BTreeMap;

@@ -3,8 +3,8 @@
 //! under the same id (the log that stated it was lost, or is in quarantine), another configuration, or an aligner that
 //! was made better.
 //!
-//! A refusal that is lost costs a try and no truth. So nothing waits for it, and it waits itself, for other records to go
-//! to the disk with or until there are several: a commit for each would wear small disks out.
+//! A refusal that is lost costs a try and no truth. So nothing waits for it, and it waits itself, for other records to
+//! go to the disk with or until there are several: a commit for each would wear small disks out.
 
 use super::Agent;
 use super::io::Record;

@@ -1,11 +1,12 @@
 //! A second look, with further keypoints, at a pair that was refused although the joint estimate says that it overlaps.
 //!
-//! A submap's blob names the address of another one that goes on with it. That one is fetched (of our own submaps, read) only
-//! then: too few matches held, and by the map the two overlap by most of what they saw. What a second look finds counts only
-//! if it is where the map that called for it has it, and the estimate lets it speak for no merge
-//! ([`MapProblem::second_looks`](crate::estimate::joint::MapProblem::second_looks)): what was looked for where it was expected
-//! is no witness that it lies there. So it makes surer what is known, and joins nothing. (Where nothing connects two frames,
-//! more keypoints find hardly a true pair more, and sooner a false one.) After a restart what was refused stays refused.
+//! A submap's blob names the address of another one that goes on with it. That one is fetched (of our own submaps,
+//! read) only then: too few matches held, and by the map the two overlap by most of what they saw. What a second look
+//! finds counts only if it is where the map that called for it has it, and the estimate lets it speak for no merge
+//! ([`MapProblem::second_looks`](crate::estimate::joint::MapProblem::second_looks)): what was looked for where it was
+//! expected is no witness that it lies there. So it makes surer what is known, and joins nothing. (Where nothing
+//! connects two frames, more keypoints find hardly a true pair more, and sooner a false one.) After a restart what was
+//! refused stays refused.
 
 use super::Agent;
 use super::knowledge::pair_of;
@@ -23,8 +24,8 @@ use std::sync::Arc;
 
 /// Pairs that wait for a second look at most; of more, the least alike go.
 pub const SECOND_LOOKS_MAX: usize = 1_024;
-/// A pair gets a second look if its anchors are no farther apart than this, at the most that is likely and in units of what
-/// both reach: then the two overlap by most of what either saw.
+/// A pair gets a second look if its anchors are no farther apart than this, at the most that is likely and in units of
+/// what both reach: then the two overlap by most of what either saw.
 const APART_MAX: f64 = 0.3;
 /// What a second look finds may be off by so much from where the map has it, in units of what both reach. The map's
 /// covariances may allow more, and places that repeat themselves do so at larger steps, or within one view.
@@ -67,8 +68,8 @@ impl Agent {
         self.address_of(id).is_some_and(|address| self.negotiation.out_of_reach.contains(&address))
     }
 
-    /// Whether what was found may stand: what a second look found is where the map has it. `None` if the map does not hold
-    /// both.
+    /// Whether what was found may stand: what a second look found is where the map has it. `None` if the map does not
+    /// hold both.
     pub(super) fn agrees_with_map(&self, work: &Work, t_mine_theirs: &Relative) -> Option<bool> {
         if work.further.is_none() {
             return Some(true);
@@ -84,8 +85,8 @@ impl Agent {
         Some(if pair_of(work.mine, work.theirs).0 == work.mine { [mine, theirs] } else { [theirs, mine] })
     }
 
-    /// Whether another's alignment of our submap was computed from its further keypoints too, so that we look with theirs;
-    /// `None` if it names other blobs than those that the owners stated.
+    /// Whether another's alignment of our submap was computed from its further keypoints too, so that we look with
+    /// theirs; `None` if it names other blobs than those that the owners stated.
     pub(super) fn is_second_look(&self, fact: &AlignmentFact) -> Option<bool> {
         let (mine, theirs) = self.ours_first(fact);
         let blob = |id| self.knowledge.submap(id).map(|submap| submap.blob);
@@ -98,8 +99,9 @@ impl Agent {
         (is_further || blob(mine) == Some(of_mine)).then_some(is_further)
     }
 
-    /// Whether another's alignment can be judged now: once their submap is known here; a second look, once our map holds both
-    /// submaps, and unless nobody in reach has their further keypoints. What cannot be looked at is not refused.
+    /// Whether another's alignment can be judged now: once their submap is known here; a second look, once our map
+    /// holds both submaps, and unless nobody in reach has their further keypoints. What cannot be looked at is not
+    /// refused.
     pub(super) fn may_be_judged(&self, fact: &AlignmentFact) -> bool {
         let (mine, theirs) = self.ours_first(fact);
         let is_known = self.knowledge.submap(theirs).is_some();
@@ -152,8 +154,8 @@ fn is_near(t_mine_theirs: &Relative, reach: f64) -> bool {
     sim.translation.norm() + DRIFT_SIGMAS * sigma <= APART_MAX * reach
 }
 
-/// Whether a relative pose is the one expected, within what the two leave open (χ², 99.9 %) and within [`OFF_MAX`]. What the
-/// anchors' errors have in common is not taken off, so that nothing true is refused for it.
+/// Whether a relative pose is the one expected, within what the two leave open (χ², 99.9 %) and within [`OFF_MAX`].
+/// What the anchors' errors have in common is not taken off, so that nothing true is refused for it.
 fn is_where_expected(expected: &Relative, found: &Relative, reach: f64) -> bool {
     let off = (expected.sim().translation - found.sim().translation).norm();
     off <= OFF_MAX * reach && two_sided::agree(expected, found)

@@ -1,9 +1,9 @@
 //! Sightings: direct measurements of another robot's body, carried to the anchors that the two bodies are known by.
 //!
-//! Nobody stands still meanwhile. Our body is known where its last keyframe was, the other's where its last beacon says,
-//! and the sighting came between: each body is taken to have moved on as it did before, and its pose is widened by how
-//! it may have sped up, slowed down or turned. What is too old to say much is refused. A range and a bearing tell a place
-//! and no rotation: then a point is carried instead of a pose.
+//! Nobody stands still meanwhile. Our body is known where its last keyframe was, the other's where its last beacon
+//! says, and the sighting came between: each body is taken to have moved on as it did before, and its pose is widened
+//! by how it may have sped up, slowed down or turned. What is too old to say much is refused. A range and a bearing
+//! tell a place and no rotation: then a point is carried instead of a pose.
 
 use super::Agent;
 use super::beacons::LATE_SIGMA_SECS;
@@ -22,8 +22,8 @@ pub const SIGHTING_AGE_SECS_MAX: f64 = 5.0;
 const ACCELERATION: [f64; 2] = [0.5, 0.5];
 /// The speed of a robot of which nobody knows how it moves, m/s and rad/s, standard deviation.
 const SPEED_UNKNOWN: [f64; 2] = [1.5, 1.0];
-/// A sighting whose rotation has a larger standard deviation, rad, tells where the other robot is, not how it is turned: no
-/// Gaussian about one rotation means much beyond.
+/// A sighting whose rotation has a larger standard deviation, rad, tells where the other robot is, not how it is
+/// turned: no Gaussian about one rotation means much beyond.
 pub const TURN_SIGMA_MAX: f64 = 0.5;
 /// Another position from the same submap to the same one is stated with so much of the variance at most.
 const NEWS: f64 = 0.5;
@@ -40,8 +40,8 @@ impl Twist {
     }
 }
 
-/// Where a body is so many seconds after (or before) it was at `t`, a time with a standard deviation of `sigma_secs`, and
-/// how sure that is.
+/// Where a body is so many seconds after (or before) it was at `t`, a time with a standard deviation of `sigma_secs`,
+/// and how sure that is.
 fn moved_on(t: &PoseWithCovariance, twist: Option<Twist>, secs: f64, sigma_secs: f64) -> PoseWithCovariance {
     let rates = twist.map_or(SPEED_UNKNOWN, |Twist(v)| [0, 3].map(|k| v.fixed_rows::<3>(k).norm()));
     let sigmas = match twist {
@@ -176,8 +176,9 @@ impl Agent {
 }
 
 impl Meeting {
-    /// A point seen at `p` along our body's axes, carried to both anchors. How our body is turned moves it sideways; how
-    /// the other's anchor is turned nobody knows here, so that its body is as uncertain in all directions as in the worst.
+    /// A point seen at `p` along our body's axes, carried to both anchors. How our body is turned moves it sideways;
+    /// how the other's anchor is turned nobody knows here, so that its body is as uncertain in all directions as in the
+    /// worst.
     fn position(&self, stamp: Stamp, p: &Vector3<f64>, covariance: &Covariance<3>) -> PositionFact {
         let body = &self.t_i_body;
         let r_i_body = body.pose.rotation.matrix();
@@ -256,7 +257,8 @@ mod tests {
         assert!(sigma(&moved_on(&t, None, 1.5, 0.0)) > SPEED_UNKNOWN[0] * 1.5);
     }
 
-    /// Of one pair of submaps the first is news, and what has half the variance; as soon as we are known by another, all is.
+    /// Of one pair of submaps the first is news, and what has half the variance; as soon as we are known by another,
+    /// all is.
     #[test]
     fn a_position_is_news_once_and_where_it_is_much_surer() {
         let id = |index: u32| SubmapId { frame: FrameId { robot: RobotId([1; 8]), epoch: 1 }, index };

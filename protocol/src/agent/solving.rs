@@ -105,8 +105,8 @@ impl Agent {
         self.solved_for_own()?.anchors.get(&submap)
     }
 
-    /// `t_own_body` of a body that is known by the anchor of a submap: estimate ∘ beacon, and what their errors have to do
-    /// with one another.
+    /// `t_own_body` of a body that is known by the anchor of a submap: estimate ∘ beacon, and what their errors have to
+    /// do with one another.
     pub(super) fn t_own_body(&self, anchor: SubmapId, t_anchor_body: &PoseWithCovariance) -> Option<Relative> {
         let solved = self.solved_for_own()?;
         let t_own_anchor = solved.anchors.get(&anchor)?;

@@ -52,8 +52,8 @@ impl Stated {
         self.between(pair) >= ALIGNMENTS_PER_FRAME_PAIR
     }
 
-    /// Standard deviation of the translation of an alignment between the two frames, over all axes, in the mean and in the
-    /// unit of the second; `None` without any.
+    /// Standard deviation of the translation of an alignment between the two frames, over all axes, in the mean and in
+    /// the unit of the second; `None` without any.
     pub(super) fn sigma(&self, (i, j): Pair) -> Option<f64> {
         let of_frames = self.of_frames.get(&(i.frame, j.frame))?;
         Some((of_frames.variance / of_frames.count as f64).sqrt())

@@ -1,6 +1,6 @@
-//! What a robot may put on a link, by class: pose > facts > repair > have > blobs (DESIGN §4). One token bucket of bytes;
-//! a class may spend only what the bucket holds beyond the reserve of the classes above it, so that on a slow link poses
-//! keep their pace, then new facts go, then repair, and blobs take what is left.
+//! What a robot may put on a link, by class: pose > facts > repair > have > blobs (DESIGN §4). One token bucket of
+//! bytes; a class may spend only what the bucket holds beyond the reserve of the classes above it, so that on a slow
+//! link poses keep their pace, then new facts go, then repair, and blobs take what is left.
 //!
 //! All that a robot sends comes out of one bucket, broadcasts once: questions do not say who asks, and on a radio all
 //! links share the air. So no link of the robot carries more than the rate and, after a pause, one burst
@@ -93,8 +93,8 @@ impl Budget {
         self.0.set(now, (self.0.level(now) - bytes as f64).max(-self.0.full()));
     }
 
-    /// An answer goes out that was cut to what was left, or says "not now" in a few bytes. It never takes what belongs to
-    /// the classes above: whoever asks without end must not silence them.
+    /// An answer goes out that was cut to what was left, or says "not now" in a few bytes. It never takes what belongs
+    /// to the classes above: whoever asks without end must not silence them.
     pub fn pay_answer(&mut self, now: Instant, class: Class, bytes: usize) {
         self.pay(now, bytes.min(self.left(now, class)));
     }

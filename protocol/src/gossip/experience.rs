@@ -1,8 +1,8 @@
-//! What questions about small differences are worth while news keep coming. A neighbour that holds a fact more than we do
-//! may only have heard it sooner: it is on its way to us, and who asks pays for a vector that brings nothing. Whether it is
-//! so depends on the links, so each robot learns it from its own questions. Where messages are lost, questions bring
-//! something and go on being asked; where none are, they become rare. A difference that stays when nothing new comes any
-//! more is asked about at once, as is a large one.
+//! What questions about small differences are worth while news keep coming. A neighbour that holds a fact more than we
+//! do may only have heard it sooner: it is on its way to us, and who asks pays for a vector that brings nothing.
+//! Whether it is so depends on the links, so each robot learns it from its own questions. Where messages are lost,
+//! questions bring something and go on being asked; where none are, they become rare. A difference that stays when
+//! nothing new comes any more is asked about at once, as is a large one.
 
 use super::FAR_APART;
 use crate::time::Instant;

@@ -1,15 +1,15 @@
-//! How sets of facts become equal, at the lowest cost known (DESIGN §4): who announces when, who asks whom, and for what.
-//! Pure decisions over a [`Replica`]; the agent carries them out, and the simulator measures them by the thousand.
+//! How sets of facts become equal, at the lowest cost known (DESIGN §4): who announces when, who asks whom, and for
+//! what. Pure decisions over a [`Replica`]; the agent carries them out, and the simulator measures them by the
+//! thousand.
 //!
 //! - **Announce** the root hash: 18 bytes or so. While nothing changes, the pauses double and a robot that has heard
 //!   enough equal roots stays silent (Trickle, RFC 6206). News are announced the sooner the more of them there are.
 //! - **Pull**: a neighbour with another root is asked for what we lack, by have-vector; one question at a time, to the
 //!   neighbour that promises most, so that nothing is fetched twice. Small gains wait for more, large ones do not, nor
-//!   what follows a large one: after a partition the last few facts are as welcome as the first many.
-//!   A question that is overdue keeps nobody back: others are asked, then the same neighbour again, and what the lost
-//!   one cost is given back. Questions that bring nothing, because what they ask for is on its way, become dearer, as
-//!   long as news keep coming. How long is overdue, answers tell (RFC 6298), and what is at stake: nobody waits long for
-//!   little.
+//!   what follows a large one: after a partition the last few facts are as welcome as the first many. A question that
+//!   is overdue keeps nobody back: others are asked, then the same neighbour again, and what the lost one cost is given
+//!   back. Questions that bring nothing, because what they ask for is on its way, become dearer, as long as news keep
+//!   coming. How long is overdue, answers tell (RFC 6298), and what is at stake: nobody waits long for little.
 //! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
 //! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
 //!   pause that doubles until either side changes.
@@ -179,8 +179,8 @@ impl AntiEntropy {
         self.announce.news(now, new, self.neighbours.len());
     }
 
-    /// The next thing to do, if any; call until `None`. While `busy` (entries on their way to the disk) nothing is asked:
-    /// our vector is stale, and what it lacks would be fetched twice.
+    /// The next thing to do, if any; call until `None`. While `busy` (entries on their way to the disk) nothing is
+    /// asked: our vector is stale, and what it lacks would be fetched twice.
     pub fn step(&mut self, now: Instant, replica: &Replica, busy: bool, rng: &mut impl Rng) -> Option<Step> {
         if self.neighbours.is_empty() {
             self.wake = Instant::MAX; // Whoever comes is told.

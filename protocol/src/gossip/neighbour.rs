@@ -139,14 +139,14 @@ impl Neighbour {
         Some(question.stake)
     }
 
-    /// Share of what it promises that may be counted on. Called when no question keeps others back: one that is under way
-    /// is overdue.
+    /// Share of what it promises that may be counted on. Called when no question keeps others back: one that is under
+    /// way is overdue.
     pub fn retry_discount(&self) -> f64 {
         if self.asked.is_some() { HOPE } else { 1.0 }
     }
 
-    /// How many facts a question may bring; or when to think about it again. Our root and count; `first`: where both may
-    /// ask, it is we who do; `strangers`: neighbours we never compared with.
+    /// How many facts a question may bring; or when to think about it again. Our root and count; `first`: where both
+    /// may ask, it is we who do; `strangers`: neighbours we never compared with.
     pub fn promises(
         &mut self,
         now: Instant,

@@ -1,5 +1,5 @@
-//! How soon a message may go out: a bucket of tokens that fills slowly lets a few go at once and holds back a stream of them, and
-//! a message that moves much pays for itself.
+//! How soon a message may go out: a bucket of tokens that fills slowly lets a few go at once and holds back a stream of
+//! them, and a message that moves much pays for itself.
 
 use crate::time::Instant;
 use core::time::Duration;

@@ -29,7 +29,8 @@ pub enum AppendError {
         /// The latest one.
         latest: u32,
     },
-    /// This robot began so many epochs that nobody would take another. Two processes with its key do that to one another.
+    /// This robot began so many epochs that nobody would take another. Two processes with its key do that to one
+    /// another.
     #[error(
         "{0} has more epochs than gossip.epochs_per_robot_max, and the others would refuse one more; see that only one \
          process runs under its key, and give the robot a new key"
@@ -42,8 +43,8 @@ pub enum AppendError {
 }
 
 impl Replica {
-    /// OverlapFeatures a fact as the next entry of this robot's log of `frame_epoch`. It is held at once, but shown to nobody
-    /// until [`Replica::mark_durable`].
+    /// OverlapFeatures a fact as the next entry of this robot's log of `frame_epoch`. It is held at once, but shown to
+    /// nobody until [`Replica::mark_durable`].
     ///
     /// # Errors
     /// [`AppendError`]; no state changes.
@@ -54,8 +55,9 @@ impl Replica {
         Ok(entry)
     }
 
-    /// OverlapFeatures these facts as the next entries of this robot's log of `frame_epoch`; the first states its own place as the
-    /// floor, and once it is durable everything below it is gone, here and on every robot that hears of it.
+    /// OverlapFeatures these facts as the next entries of this robot's log of `frame_epoch`; the first states its own
+    /// place as the floor, and once it is durable everything below it is gone, here and on every robot that hears of
+    /// it.
     ///
     /// # Errors
     /// [`AppendError`]; no state changes.

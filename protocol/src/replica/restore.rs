@@ -1,5 +1,5 @@
-//! Loading a store. The hash chain is checked entry by entry, the signature only of each log's last entry: it covers its
-//! predecessor's hash, hence the whole log. 36,000 entries cost one hash each and one signature a log.
+//! Loading a store. The hash chain is checked entry by entry, the signature only of each log's last entry: it covers
+//! its predecessor's hash, hence the whole log. 36,000 entries cost one hash each and one signature a log.
 
 use super::log::{Held, Link, Log};
 use super::set::{IngestError, Ingested, Replica, Slot};

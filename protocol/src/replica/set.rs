@@ -1,5 +1,5 @@
-//! All logs together, and the way in for everything that arrives, [`Replica::ingest`] (this robot's own facts come in by
-//! [`Replica::append`]). Checks run from cheap to dear (size, form, swarm, roster, duplicates, limits, signature,
+//! All logs together, and the way in for everything that arrives, [`Replica::ingest`] (this robot's own facts come in
+//! by [`Replica::append`]). Checks run from cheap to dear (size, form, swarm, roster, duplicates, limits, signature,
 //! chain), so that a flood of foreign entries costs no signature check and no memory.
 
 use super::fork::ForkProof;
@@ -86,7 +86,8 @@ pub enum IngestError {
     /// The log is as long as is held.
     #[error("entry {0} is beyond gossip.entries_per_frame_max")]
     SeqLimit(EntryId),
-    /// The floor that it states is neither its predecessor's nor its own place: the log ends here, on every robot alike.
+    /// The floor that it states is neither its predecessor's nor its own place: the log ends here, on every robot
+    /// alike.
     #[error("entry {0} states a floor that is neither its predecessor's nor its own place")]
     FloorMoved(EntryId),
     /// Its predecessor is missing, and so many nearer ones wait already that it was not kept.

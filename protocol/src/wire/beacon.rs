@@ -53,7 +53,8 @@ struct RawBody {
 }
 
 impl Beacon {
-    /// OverlapFeatures a beacon. Its content is what a receiver will read: rounded, with a covariance that is never smaller.
+    /// OverlapFeatures a beacon. Its content is what a receiver will read: rounded, with a covariance that is never
+    /// smaller.
     ///
     /// # Errors
     /// [`EstimateError`] if the pose is out of range.

@@ -1,9 +1,9 @@
-//! A log entry: one signed fact in its place. An entry names its predecessor by BLAKE3 hash (all 32 bytes: the hash of a
-//! log's last entry then stands for the whole log, and so does that entry's signature), so a writer cannot tell two
+//! A log entry: one signed fact in its place. An entry names its predecessor by BLAKE3 hash (all 32 bytes: the hash of
+//! a log's last entry then stands for the whole log, and so does that entry's signature), so a writer cannot tell two
 //! stories without leaving a proof. The payload of an unknown kind is carried as it is.
 //!
-//! Canonical bytes = postcard body, then the 64-byte ed25519 signature over `SIGNING_CONTEXT ‖ body`. The hash of an entry
-//! is that of all its canonical bytes.
+//! Canonical bytes = postcard body, then the 64-byte ed25519 signature over `SIGNING_CONTEXT ‖ body`. The hash of an
+//! entry is that of all its canonical bytes.
 
 use super::fact::Fact;
 use super::frame::to_bytes;

@@ -45,7 +45,8 @@ pub struct SubmapFact {
     pub blob: Hash,
     /// Unit of the frame.
     pub scale: ScaleKind,
-    /// How many keyframes made it; older robots do not tell. The middle one, of an even number the earlier, is its anchor.
+    /// How many keyframes made it; older robots do not tell. The middle one, of an even number the earlier, is its
+    /// anchor.
     pub keyframes: Option<NonZero<u16>>,
 }
 
@@ -64,8 +65,8 @@ pub struct AlignmentFact {
     pub support: u16,
     /// log₁₀ of the number of false alarms.
     pub log10_nfa: f32,
-    /// Keypoint blobs of `i` and `j` it was computed from. If the writer looked at further keypoints of the other's submap as
-    /// well, the blob that holds these stands in the place of that submap's first one, which names it.
+    /// Keypoint blobs of `i` and `j` it was computed from. If the writer looked at further keypoints of the other's
+    /// submap as well, the blob that holds these stands in the place of that submap's first one, which names it.
     pub blobs: [Hash; 2],
 }
 
@@ -109,8 +110,8 @@ pub struct SightingFact {
     pub t_i_j: PoseWithCovariance,
 }
 
-/// Where another robot was seen (range and bearing), carried to anchors by the observer: a point of one submap, seen from
-/// another.
+/// Where another robot was seen (range and bearing), carried to anchors by the observer: a point of one submap, seen
+/// from another.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PositionFact {
     /// When, on the observer's clock.
@@ -127,9 +128,9 @@ pub struct PositionFact {
     pub covariance: Covariance<3>,
 }
 
-/// Two submaps of the frame that the entry is of, which its owner looked at for a loop, and of which one fits at two places of
-/// the other ([`RefusalReason::Ambiguous`], but for what only could be turned, slid or mirrored where it is): a frame that has
-/// many of them repeats itself.
+/// Two submaps of the frame that the entry is of, which its owner looked at for a loop, and of which one fits at two
+/// places of the other ([`RefusalReason::Ambiguous`], but for what only could be turned, slid or mirrored where it is):
+/// a frame that has many of them repeats itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LookalikeFact {
     /// Index of the earlier one.

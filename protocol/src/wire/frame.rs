@@ -1,6 +1,6 @@
 //! The frame around every message: magic (2 bytes), version, kind, postcard body. Decoding is strict: the length is
-//! checked against the kind's limit first, the body must fill the frame exactly, and what was decoded must encode to the
-//! very bytes received, so that each message has one form.
+//! checked against the kind's limit first, the body must fill the frame exactly, and what was decoded must encode to
+//! the very bytes received, so that each message has one form.
 
 use super::limits::{BEACON_LEN_MAX, HAVE_LEN_MAX, HEADER_LEN, MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX, SMALL_LEN_MAX};
 use super::pose::PoseError;

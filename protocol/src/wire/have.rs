@@ -3,9 +3,9 @@
 //!
 //! A head is the number of entries held, without holes. Because entries are chained by hash, an entry that does not
 //! follow from the asker's last one shows a fork by itself; only where nothing follows is a hash needed to see it. So
-//! the first vector between two neighbours, and any after an exchange that explained nothing, carries four bytes of each
-//! last entry's hash; the others leave them out. A log known to be forked is named as such, so that the proof is not
-//! sent again.
+//! the first vector between two neighbours, and any after an exchange that explained nothing, carries four bytes of
+//! each last entry's hash; the others leave them out. A log known to be forked is named as such, so that the proof is
+//! not sent again.
 //!
 //! On the wire robots are numbers: places in the roster, named by its hash, where both sides share it, else in a list
 //! that comes along. Places and epochs are steps from the head before. A head then takes 3 to 5 bytes instead of 19.

@@ -21,7 +21,8 @@ pub const SMALL_LEN_MAX: usize = 96;
 pub const ENTRY_LEN_MAX: usize = 2048;
 /// Longest payload of a log entry.
 pub const PAYLOAD_LEN_MAX: usize = 1900;
-/// Facts that one condensed fact carries at most: more than a payload of verdicts, the shortest ones but for lookalikes.
+/// Facts that one condensed fact carries at most: more than a payload of verdicts, the shortest ones but for
+/// lookalikes.
 pub const CARRIED_MAX: usize = 120;
 /// Longest submap summary.
 pub const SUMMARY_LEN_MAX: usize = 400;

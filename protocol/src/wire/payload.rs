@@ -211,8 +211,8 @@ impl Raw {
     }
 }
 
-/// A submap, and the number of its keyframes behind it, where it is told: what submaps were written as before it was stays
-/// what it is.
+/// A submap, and the number of its keyframes behind it, where it is told: what submaps were written as before it was
+/// stays what it is.
 fn submap(bytes: &[u8]) -> Result<Raw, FactError> {
     let (submap, rest) = postcard::take_from_bytes(bytes).map_err(FactError::Malformed)?;
     let keyframes = if rest.is_empty() { None } else { Some(whole(rest)?) };

@@ -5,8 +5,8 @@ use merganser_protocol::agent::io::{Event, Input};
 use merganser_protocol::time::Instant;
 use std::time::Duration;
 
-/// Two robots that drive and then wait: when both know that they have merged, the bytes of keypoints fetched by then and
-/// in all, and the pairs aligned.
+/// Two robots that drive and then wait: when both know that they have merged, the bytes of keypoints fetched by then
+/// and in all, and the pairs aligned.
 fn merge_at(further_bytes_per_sec: f64) -> (Option<Instant>, [usize; 2], usize) {
     let world = World::new(1);
     let mut config = super::common::config();

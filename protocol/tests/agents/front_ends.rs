@@ -123,8 +123,8 @@ fn another_session_begins_an_epoch_at_once() {
     assert_eq!(begun(&wires), vec![EpochReason::Told]);
 }
 
-/// An old SLAM that is not dead yet beside the new one: of the old one all is refused, and the odometry of the new one has no
-/// holes by it.
+/// An old SLAM that is not dead yet beside the new one: of the old one all is refused, and the odometry of the new one
+/// has no holes by it.
 #[test]
 fn two_sessions_that_take_turns_begin_one_epoch() {
     let of = |session: u64, keyframe: Keyframe| Keyframe { session: Some(session), ..keyframe };

@@ -1,5 +1,5 @@
-//! A pair that was refused although the map has it overlap is looked at once more with further keypoints, by both ends; what
-//! contradicts the map, or joins what the map does not, is no alignment.
+//! A pair that was refused although the map has it overlap is looked at once more with further keypoints, by both ends;
+//! what contradicts the map, or joins what the map does not, is no alignment.
 
 use super::common::{Wires, World, agent_of, config, drive, robot};
 use merganser_protocol::agent::Restored;

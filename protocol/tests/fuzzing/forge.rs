@@ -1,5 +1,5 @@
-//! What the liar and the thief write: entries that are rightly signed and say anything, in logs with holes, two histories,
-//! falling floors, of other swarms, of closed and far epochs; and beacons, questions and answers to match.
+//! What the liar and the thief write: entries that are rightly signed and say anything, in logs with holes, two
+//! histories, falling floors, of other swarms, of closed and far epochs; and beacons, questions and answers to match.
 
 use super::people::{AGENTS, ROBOTS, described, key, robot, sigmas, swarm};
 use super::reader::Reader;

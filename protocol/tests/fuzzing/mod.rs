@@ -1,6 +1,6 @@
-//! What the fuzz targets of `protocol/fuzz` do with bytes, shared with the test `fuzz_corpus`, which replays their corpus
-//! on a stable compiler. [`decode`] gives bytes to every decoder; [`handle`] reads them as a story of two agents, a liar
-//! who is a member, a thief of keys, and a bad network (DESIGN §8.7, §8.8).
+//! What the fuzz targets of `protocol/fuzz` do with bytes, shared with the test `fuzz_corpus`, which replays their
+//! corpus on a stable compiler. [`decode`] gives bytes to every decoder; [`handle`] reads them as a story of two
+//! agents, a liar who is a member, a thief of keys, and a bad network (DESIGN §8.7, §8.8).
 #![allow(
     dead_code,
     missing_docs,

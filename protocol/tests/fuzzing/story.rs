@@ -1,6 +1,6 @@
-//! Bytes as a story: who does what to which of two agents, and when. Messages of the agents are delivered, lost, replayed,
-//! damaged and brought to the wrong door; the liar and the thief add their own; disks, clocks, jobs and sensors fail in
-//! every order. Whatever happens, the agents do not panic and keep the contract ([`super::checks`]).
+//! Bytes as a story: who does what to which of two agents, and when. Messages of the agents are delivered, lost,
+//! replayed, damaged and brought to the wrong door; the liar and the thief add their own; disks, clocks, jobs and
+//! sensors fail in every order. Whatever happens, the agents do not panic and keep the contract ([`super::checks`]).
 
 use super::Meter;
 use super::checks::{Asked, Shell};

@@ -1,5 +1,5 @@
-//! Real submaps with true poses, from the data folder (`MERGANSER_SHARED` or `../shared` beside the workspace): the sets
-//! of the prototype, ten RGB-D submaps of one room and five LiDAR scans along a street.
+//! Real submaps with true poses, from the data folder (`MERGANSER_SHARED` or `../shared` beside the workspace): the
+//! sets of the prototype, ten RGB-D submaps of one room and five LiDAR scans along a street.
 
 use merganser_protocol::config::{Sensor, SubmapConfig};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
@@ -100,7 +100,8 @@ pub fn seven_scenes(data: &Path) -> Set {
     Set { name: "7scenes", places: places.collect(), rotation_deg_max: 15.0, translation_max: 0.3 }
 }
 
-/// 7-Scenes as a robot has it whose camera is believed to have this focal length: three keyframes a second at true poses.
+/// 7-Scenes as a robot has it whose camera is believed to have this focal length: three keyframes a second at true
+/// poses.
 pub fn believed_scenes(data: &Path, focal: f32) -> Vec<(Se3, Vec<[f32; 3]>)> {
     let folder = data.join("rgbd_7scenes");
     let poses = camera_poses(&folder);

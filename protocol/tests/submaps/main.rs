@@ -154,8 +154,8 @@ fn shelves_and_rooms_without_end_are_ambiguous() {
     repeats_are_ambiguous(&[(false, 3.0), (false, 5.0), (true, 3.0), (true, 5.0)], &[1, 5]);
 }
 
-/// Of aisles with walls or without, cells of so many metres, and of halls with these seeds: two worlds of each kind of aisle,
-/// if two halls are asked for.
+/// Of aisles with walls or without, cells of so many metres, and of halls with these seeds: two worlds of each kind of
+/// aisle, if two halls are asked for.
 fn repeats_are_ambiguous(aisles: &[(bool, f64)], halls: &[u64]) {
     let worlds = halls.len();
     let tally = |worlds: Vec<(World, [f64; 2])>| {

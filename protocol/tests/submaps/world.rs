@@ -40,8 +40,8 @@ impl World {
         Self { boxes: vec![[Vector3::new(-100.0, -1.0, 0.0), Vector3::new(100.0, 1.0, 2.5)]], pillars: vec![] }
     }
 
-    /// A corridor four metres wide whose ends are beyond the sensor's range, and so many cupboards in it, which alone tell
-    /// how far along it one is.
+    /// A corridor four metres wide whose ends are beyond the sensor's range, and so many cupboards in it, which alone
+    /// tell how far along it one is.
     pub fn furnished_corridor(cupboards: usize) -> Self {
         let walls = [Vector3::new(-100.0, -2.0, 0.0), Vector3::new(100.0, 2.0, 2.5)];
         let cupboard = |k: usize| {
@@ -52,8 +52,8 @@ impl World {
         Self { boxes: std::iter::once(walls).chain((0..cupboards).map(cupboard)).collect(), pillars: vec![] }
     }
 
-    /// Shelves without end: one furnished cell of so many metres again and again, with aisles along x between; or, if they
-    /// have walls, rooms with doors where the aisles pass.
+    /// Shelves without end: one furnished cell of so many metres again and again, with aisles along x between; or, if
+    /// they have walls, rooms with doors where the aisles pass.
     pub fn aisles(cell: f64, walls: bool, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let middle = cell / 2.0;

@@ -4,10 +4,11 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Standard deviation of a vertical that comes without one, about each horizontal axis, rad: what SLAMs with an inertial
-/// sensor reach, and to spare.
+/// Standard deviation of a vertical that comes without one, about each horizontal axis, rad: what SLAMs with an
+/// inertial sensor reach, and to spare.
 pub const UP_SIGMA_RAD: f64 = 0.02;
-/// Standard deviations of a vertical that may be stated, rad. Below it nothing is mounted so exactly; above it nothing is told.
+/// Standard deviations of a vertical that may be stated, rad. Below it nothing is mounted so exactly; above it nothing
+/// is told.
 pub const UP_SIGMA_RANGE_RAD: core::ops::RangeInclusive<f64> = 1e-3..=0.5;
 /// A pose on a link, bytes (DESIGN §5).
 const POSE_BYTES: f64 = 160.0;
@@ -41,11 +42,12 @@ pub struct SubmapConfig {
     pub rotation_deg: f64,
     /// ...or after this many keyframes...
     pub keyframes_max: u32,
-    /// ...or with the first keyframe so long after its first, unless the robot stood all the time: odometry that rests on
-    /// inertia drifts by the second.
+    /// ...or with the first keyframe so long after its first, unless the robot stood all the time: odometry that rests
+    /// on inertia drifts by the second.
     pub secs_max: f64,
-    /// ...or before a motion with which the position along it would be known only to this standard deviation (the widest
-    /// axis): a cloud that is bent by more says little. Choose several times what the odometry gathers in `distance_m`...
+    /// ...or before a motion with which the position along it would be known only to this standard deviation (the
+    /// widest axis): a cloud that is bent by more says little. Choose several times what the odometry gathers in
+    /// `distance_m`...
     pub sigma_max_m: f64,
     /// ...or its rotation only to this.
     pub sigma_max_deg: f64,
@@ -53,22 +55,24 @@ pub struct SubmapConfig {
     pub points_max: usize,
     /// Keypoints offered to others at first, 21 bytes each: 330, and the address of the further ones, are 7.0 kB.
     pub keypoints: usize,
-    /// Further ones, for a second look at a pair that was refused where the joint estimate says that it overlaps. None with 0.
+    /// Further ones, for a second look at a pair that was refused where the joint estimate says that it overlaps. None
+    /// with 0.
     pub keypoints_further: usize,
     /// Whether frame units are metres.
     pub scale: crate::kinds::ScaleKind,
     /// Odometry standard deviation assumed across a gap in the keyframes, per metre travelled.
     pub gap_sigma_per_m: f64,
-    /// The fastest that the robot drives or flies. A keyframe farther than this lets it be is refused, and several that go on
-    /// from there begin a new epoch; within `distance_m` of the last one, none is. Twice the robot's top speed is a good
-    /// choice. Without effect where the scale is unknown: there, and besides, steps are held against those before.
+    /// The fastest that the robot drives or flies. A keyframe farther than this lets it be is refused, and several that
+    /// go on from there begin a new epoch; within `distance_m` of the last one, none is. Twice the robot's top speed is
+    /// a good choice. Without effect where the scale is unknown: there, and besides, steps are held against those
+    /// before.
     pub speed_max_m_s: f64,
     /// The fastest that it turns, likewise; within `rotation_deg`, none is refused.
     pub turn_max_deg_s: f64,
     /// Who tells which way is up. A pair of submaps that both know it is aligned surer and for less.
     pub gravity: Gravity,
-    /// Where the frame tells: standard deviation of its z axis from the vertical, about each horizontal axis. Most SLAMs with
-    /// an inertial sensor stay below 0.02; a car's on hilly streets without one below 0.1.
+    /// Where the frame tells: standard deviation of its z axis from the vertical, about each horizontal axis. Most
+    /// SLAMs with an inertial sensor stay below 0.02; a car's on hilly streets without one below 0.1.
     pub gravity_sigma_rad: f64,
 }
 
@@ -116,8 +120,8 @@ pub enum Sensor {
     /// descriptor.
     #[serde(rename = "landmarks")]
     Landmarks,
-    /// Landmarks on the plane in which the robot drives, such as range and bearing give them. Poses are taken as planar,
-    /// heights are left out, and nothing is claimed to be known of height and tilt.
+    /// Landmarks on the plane in which the robot drives, such as range and bearing give them. Poses are taken as
+    /// planar, heights are left out, and nothing is claimed to be known of height and tilt.
     #[serde(rename = "landmarks_2d")]
     Landmarks2d,
 }
@@ -129,7 +133,8 @@ pub enum Gravity {
     /// Each keyframe itself, if it says so (`up`).
     #[default]
     Keyframes,
-    /// The frame: its z axis points up, as that of SLAMs with an inertial sensor does. A keyframe's own word goes before.
+    /// The frame: its z axis points up, as that of SLAMs with an inertial sensor does. A keyframe's own word goes
+    /// before.
     FrameZ,
 }
 
@@ -160,8 +165,8 @@ pub struct AlignConfig {
     pub sigma_max_voxels: f64,
     /// An alignment needs log₁₀ NFA below this.
     pub log10_nfa_max: f64,
-    /// ...where a scale is unknown, or of landmarks in space, at least this support (sum of inlier probabilities; elsewhere
-    /// clouds judge)...
+    /// ...where a scale is unknown, or of landmarks in space, at least this support (sum of inlier probabilities;
+    /// elsewhere clouds judge)...
     pub support_min: f64,
     /// ...and at least this share of keypoints with a counterpart in the other cloud.
     pub fit_min: f64,
@@ -171,8 +176,8 @@ pub struct AlignConfig {
     pub candidates_max: usize,
     /// Similarity of summaries (0 to 1) from which a pair is a candidate.
     pub similarity_min: f64,
-    /// Bytes of keypoints and facts per second, in the mean, for aligning further what has merged already: a longer drive
-    /// and a surer map. Until two frames have merged they are aligned as fast as the link lets.
+    /// Bytes of keypoints and facts per second, in the mean, for aligning further what has merged already: a longer
+    /// drive and a surer map. Until two frames have merged they are aligned as fast as the link lets.
     pub further_bytes_per_sec: f64,
 }
 
@@ -226,8 +231,8 @@ impl Default for EstimateConfig {
 pub struct GossipConfig {
     /// Longest time between two announcements of the root hash. They come this rarely only while nothing changes.
     pub have_secs: f64,
-    /// Shortest time between two pose beacons: each tells of a keyframe at once. One that tells nothing new, of a robot that
-    /// stands, waits 2.5 times as long.
+    /// Shortest time between two pose beacons: each tells of a keyframe at once. One that tells nothing new, of a robot
+    /// that stands, waits 2.5 times as long.
     pub pose_secs: f64,
     /// Bytes of entries in one sync answer at most.
     pub delta_bytes_max: usize,

@@ -40,8 +40,8 @@ pub enum PairStatus {
     Merged,
     /// Agreed alignments, but fewer than needed.
     Provisional,
-    /// Two rival groups of alignments; or about as many pairs of submaps that fit in several ways as hold, between the two or
-    /// within either, so that the place repeats itself.
+    /// Two rival groups of alignments; or about as many pairs of submaps that fit in several ways as hold, between the
+    /// two or within either, so that the place repeats itself.
     Ambiguous,
     /// Alignments contradict one another.
     Inconsistent,

@@ -1,7 +1,7 @@
 //! Correspondence problems with known truth, from `.corr` files.
 //!
-//! Little-endian: `CORRv001`, u32 N, u32 outliers (not used), f64 σ, scale, 9 of R by rows, 3 of t, then f32 source (3 N),
-//! f32 target (3 N), u8 kind (N): 1 true, 0 random, 2 of a second, false motion. A file's name tells its cell:
+//! Little-endian: `CORRv001`, u32 N, u32 outliers (not used), f64 σ, scale, 9 of R by rows, 3 of t, then f32 source (3
+//! N), f32 target (3 N), u8 kind (N): 1 true, 0 random, 2 of a second, false motion. A file's name tells its cell:
 //! `<group>_N<points>_o<outliers in %>_s<seed>.corr`, group SE3, SIM3 or ALIAS.
 
 use super::row::Problem;

@@ -140,7 +140,8 @@ fn scenario(robots: usize, flooded: bool) -> Scenario {
     scenario
 }
 
-/// What earlier runs took must not hide what the next one takes. Where the system cannot, the first run's growth counts.
+/// What earlier runs took must not hide what the next one takes. Where the system cannot, the first run's growth
+/// counts.
 fn forget_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }

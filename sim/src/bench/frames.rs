@@ -1,4 +1,5 @@
-//! The frame-level consensus on seeded worlds: MATH §5's table with refusals, wrong merges and the covariance's honesty.
+//! The frame-level consensus on seeded worlds: MATH §5's table with refusals, wrong merges and the covariance's
+//! honesty.
 
 use merganser_protocol::estimate::frames::world::{Draw, SimWorld, World};
 use merganser_protocol::estimate::frames::{

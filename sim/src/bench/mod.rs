@@ -45,8 +45,8 @@ pub enum Bench {
     Graph(graph::GraphBench),
     /// Seeing the same place on recorded data: alignments, candidates, bytes and time, beside KISS-Matcher
     ///
-    /// Alignments are one way: one submap's keypoints against the other's features. Times are of the processor. Exit code 1
-    /// if a wrong alignment was accepted or fewer were found than promised, 2 if the data cannot be used.
+    /// Alignments are one way: one submap's keypoints against the other's features. Times are of the processor. Exit
+    /// code 1 if a wrong alignment was accepted or fewer were found than promised, 2 if the data cannot be used.
     Places(places::Places),
     /// Pose graphs split among robots who share their measurements: bytes sent until all have the whole optimum
     ///
@@ -60,14 +60,14 @@ pub enum Bench {
     Flood(flood::Flood),
     /// Robots that drive for minutes: when they merge, how far off their map is, and what they send
     ///
-    /// Scans are ray-cast, so this takes a while: about twice the time driven, for ten robots. Exit code 1 if robots that
-    /// see the same take more than 60 s to merge, the map errs by more than 1.1 times that of a solver given every true
-    /// loop, or a robot sends more than 1 kB/s.
+    /// Scans are ray-cast, so this takes a while: about twice the time driven, for ten robots. Exit code 1 if robots
+    /// that see the same take more than 60 s to merge, the map errs by more than 1.1 times that of a solver given every
+    /// true loop, or a robot sends more than 1 kB/s.
     Mission(mission::Mission),
     /// Whether frames, submaps and live poses of simulated swarms are as uncertain as they say
     ///
-    /// Alignments are made up, and err as much as they say. Exit code 1 if a mean normalised error lies outside of 0.93 to
-    /// 1.07 times its degrees of freedom.
+    /// Alignments are made up, and err as much as they say. Exit code 1 if a mean normalised error lies outside of 0.93
+    /// to 1.07 times its degrees of freedom.
     Calibration(calibration::Calibration),
     /// Frame-level consensus on seeded worlds: success, refusals and honesty of the covariance
     ///

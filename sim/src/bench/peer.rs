@@ -8,8 +8,8 @@ use std::process::{Command, Stdio};
 
 const SCRIPT: &str = include_str!("../../bench/peers.py");
 
-/// Runs `solvers` (all there are, if none is named) on the files, told `sigma`'s upper bound. The rows, and why a solver
-/// is missing.
+/// Runs `solvers` (all there are, if none is named) on the files, told `sigma`'s upper bound. The rows, and why a
+/// solver is missing.
 ///
 /// # Errors
 /// An interpreter that does not start, or output that is no rows.

@@ -1,5 +1,5 @@
-//! One line of the CSV: what one solver gave on one problem. A wrong answer that was accepted has status `ok`; its errors
-//! tell.
+//! One line of the CSV: what one solver gave on one problem. A wrong answer that was accepted has status `ok`; its
+//! errors tell.
 
 use std::fmt;
 

@@ -1,6 +1,6 @@
-//! Memory and disk are bounded by roster × window, whatever arrives (DESIGN §8.7): no log of a stranger is held, no more
-//! epochs of a robot than configured, no more batches wait for the disk than named, no table grows with what shouts, and
-//! the store's file stays within a bound.
+//! Memory and disk are bounded by roster × window, whatever arrives (DESIGN §8.7): no log of a stranger is held, no
+//! more epochs of a robot than configured, no more batches wait for the disk than named, no table grows with what
+//! shouts, and the store's file stays within a bound.
 
 use super::{Check, RobotSample, Sample, Seen};
 use merganser_protocol::config::GossipConfig;

@@ -15,8 +15,8 @@ pub struct Closed {
     /// The latest epoch that anybody handed an entry of to a disk, by origin.
     latest: BTreeMap<RobotId, u32>,
     /// Every entry that was handed to a disk, and whether to one of another than its writer: only such a one can come
-    /// back, and it does in a message. A process that died before its entry was on disk, or whose disk was replaced by an
-    /// old image of it, may well write the very same again.
+    /// back, and it does in a message. A process that died before its entry was on disk, or whose disk was replaced by
+    /// an old image of it, may well write the very same again.
     known: BTreeMap<(EntryId, Hash), bool>,
     doubted: BTreeSet<RobotId>,
     forgers: BTreeSet<RobotId>,

@@ -1,6 +1,7 @@
 //! When faults stop, all converge in the stated time (DESIGN §8.6): at the end of a run every robot that is running
-//! holds the same digest. A swarm that is still at work then writes on, and its last facts may be on their way: what any
-//! robot held a stated time before, all must hold, and equal logs must have equal digests. Nobody is excused by being down.
+//! holds the same digest. A swarm that is still at work then writes on, and its last facts may be on their way: what
+//! any robot held a stated time before, all must hold, and equal logs must have equal digests. Nobody is excused by
+//! being down.
 
 use super::{Check, Phase, RobotSample, Sample};
 use core::time::Duration;

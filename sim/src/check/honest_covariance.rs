@@ -1,6 +1,6 @@
-//! A merged frame's error fits the covariance claimed for it: at the end of a run, the squared normalised error of every
-//! pair of frames must be one that χ² with 6 degrees of freedom (7 where a unit is unknown) exceeds with a chance above
-//! 1e-4, all pairs of the run taken together (Bonferroni).
+//! A merged frame's error fits the covariance claimed for it: at the end of a run, the squared normalised error of
+//! every pair of frames must be one that χ² with 6 degrees of freedom (7 where a unit is unknown) exceeds with a chance
+//! above 1e-4, all pairs of the run taken together (Bonferroni).
 
 use super::{Check, Phase, Sample};
 use crate::truth::frame_errors;

@@ -1,6 +1,6 @@
-//! One place in a log, one content (DESIGN §8.5): never two entries for one (origin, epoch, seq) on the swarm's disks, and
-//! never two contents under one blob address. An entry that died with its writer before it was durable does not count:
-//! if it got out all the same, another robot's disk shows it.
+//! One place in a log, one content (DESIGN §8.5): never two entries for one (origin, epoch, seq) on the swarm's disks,
+//! and never two contents under one blob address. An entry that died with its writer before it was durable does not
+//! count: if it got out all the same, another robot's disk shows it.
 
 use super::pending::Pending;
 use super::{Check, Seen};

@@ -1,5 +1,6 @@
 //! At summary level, what takes the place of heavy work: submaps are described for real (they have few points), but an
-//! alignment is the truth about their clouds with noise, if they lie within reach, and the joint estimate may be left out.
+//! alignment is the truth about their clouds with noise, if they lie within reach, and the joint estimate may be left
+//! out.
 
 use crate::dice::Dice;
 use crate::scenario::SummaryOptions;
@@ -76,7 +77,8 @@ impl AlignmentOracle {
         if truth.translation.norm() > self.options.reach_m {
             return Err(RefusalReason::NoConsensus);
         }
-        // Whoever looks, and in whatever order: what both ends find is the same, or their mean would err by less than it says.
+        // Whoever looks, and in whatever order: what both ends find is the same, or their mean would err by less than
+        // it says.
         let (first, second) = (mine.features.min(theirs.features), mine.features.max(theirs.features));
         let is_first_look = job.theirs.further().is_some();
         let mut shy = Dice::new(self.seed, &format!("at first {first} {second}"));
@@ -112,8 +114,8 @@ impl AlignmentOracle {
     }
 }
 
-/// Where a cloud lies whose keyframes, each alone, would put its anchor there: odometry that drifts bends it, so that it is
-/// not where its anchor was. `None` without a keyframe.
+/// Where a cloud lies whose keyframes, each alone, would put its anchor there: odometry that drifts bends it, so that
+/// it is not where its anchor was. `None` without a keyframe.
 pub fn middle(t_world_anchor: &[Se3]) -> Option<Se3> {
     let about = t_world_anchor.first()?;
     let sum: Vector6<f64> = t_world_anchor.iter().map(|t| about.local(t)).sum();

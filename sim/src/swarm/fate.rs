@@ -27,7 +27,8 @@ impl<C: Core> Swarm<C> {
         let fresh_epoch = if self.scenario.machine.wall_epochs { robot.slam.wall_epoch(now) } else { incarnation };
         let (records, fresh_epoch, report) = match robot.store.boot(fresh_epoch) {
             Ok(booted) => booted,
-            // The advice that the error gives is taken: the file is moved away. (No other version is here: its number was hit.)
+            // The advice that the error gives is taken: the file is moved away. (No other version is here: its number
+            // was hit.)
             Err(StoreError::NotAStore { .. } | StoreError::Schema { .. }) => {
                 self.wipe(index);
                 self.counts.store_moved_away += 1;

@@ -46,8 +46,8 @@ impl<C: Core> Swarm<C> {
         self.queue.push(now.after(millis(1e3 * TICK)), Event::Move);
     }
 
-    /// Tells the network who is in reach of whom. Where all are, it knows. Once all is healed, no robot is out of reach of
-    /// all others: whom nobody hears, nobody can be asked to have told.
+    /// Tells the network who is in reach of whom. Where all are, it knows. Once all is healed, no robot is out of reach
+    /// of all others: whom nobody hears, nobody can be asked to have told.
     pub(super) fn reach(&mut self) {
         if self.scenario.radio == Layout::Mesh {
             return;

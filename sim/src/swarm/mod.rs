@@ -1,6 +1,6 @@
-//! The swarm: every robot's core, disk, SLAM and links in one queue of virtual time. Whatever a real shell does (deliver,
-//! persist, run jobs, time out, tell who is near) is an event here; jobs run inline and are charged virtual time.
-//! Robots' process clocks begin when their processes do, so an instant kept across a restart shows as a fault.
+//! The swarm: every robot's core, disk, SLAM and links in one queue of virtual time. Whatever a real shell does
+//! (deliver, persist, run jobs, time out, tell who is near) is an event here; jobs run inline and are charged virtual
+//! time. Robots' process clocks begin when their processes do, so an instant kept across a restart shows as a fault.
 
 mod act;
 mod alignment_oracle;

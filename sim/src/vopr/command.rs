@@ -15,8 +15,8 @@ const TWICE_EVERY: u64 = 16;
 
 /// Draw networks, machines and faults from seeds, and check every invariant.
 ///
-/// A run is a storm, in which everything that can go wrong with links, disks, processes and clocks does, and then calm, in
-/// which all must come to hold the same facts within a stated time. Exits with 0 only if no invariant broke.
+/// A run is a storm, in which everything that can go wrong with links, disks, processes and clocks does, and then calm,
+/// in which all must come to hold the same facts within a stated time. Exits with 0 only if no invariant broke.
 #[derive(Clone, Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("which").required(true).args(["seed", "seeds"])))]
 pub struct VoprArgs {

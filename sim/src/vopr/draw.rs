@@ -1,4 +1,5 @@
-//! Drawing a run from a seed. Each part has its own stream of dice, so that a change in one leaves the others as they were.
+//! Drawing a run from a seed. Each part has its own stream of dice, so that a change in one leaves the others as they
+//! were.
 
 use crate::dice::Dice;
 use crate::faults::Fault;
@@ -96,7 +97,8 @@ fn split_secs(robots: usize, dice: &mut Dice) -> Option<f64> {
     long.map(|(_, secs)| *secs).filter(|secs| robots <= CROWD || *secs <= CROWD_SPLIT_SECS_MAX)
 }
 
-/// Makes room for a long split. Robots write as much as in a short run: what all must hear of in the stated time is no more.
+/// Makes room for a long split. Robots write as much as in a short run: what all must hear of in the stated time is no
+/// more.
 fn slow_down(scenario: &mut Scenario, split_secs: f64) {
     let shorter = scenario.duration_secs;
     scenario.duration_secs += split_secs;

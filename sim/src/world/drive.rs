@@ -1,5 +1,5 @@
-//! A robot's drive: the true poses of its keyframes along its path, and the odometry its SLAM would report: every motion
-//! disturbed by noise that grows with distance and turn, with exactly the covariance it was drawn from.
+//! A robot's drive: the true poses of its keyframes along its path, and the odometry its SLAM would report: every
+//! motion disturbed by noise that grows with distance and turn, with exactly the covariance it was drawn from.
 
 use super::path::Path;
 use crate::dice::Dice;

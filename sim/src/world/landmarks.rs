@@ -41,8 +41,8 @@ pub struct LandmarkOptions {
     pub alike: f64,
     /// Share of a look's descriptors that are another landmark's.
     pub mistaken: f64,
-    /// Lengths that robots' SLAMs take for one, m: each robot whose SLAM knows no metre (`config.submap.scale = "unknown"`)
-    /// draws its own between these.
+    /// Lengths that robots' SLAMs take for one, m: each robot whose SLAM knows no metre (`config.submap.scale =
+    /// "unknown"`) draws its own between these.
     pub unit_m: [f64; 2],
     /// Robots whose SLAM does know it, whatever the configuration says of the others.
     pub metric: Vec<String>,
@@ -111,8 +111,8 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Landmarks on the surfaces about these places, as bodies see them. Where the world repeats itself every `cell_m`, so
-    /// do they: elsewhere another landmark looks just the same.
+    /// Landmarks on the surfaces about these places, as bodies see them. Where the world repeats itself every `cell_m`,
+    /// so do they: elsewhere another landmark looks just the same.
     pub fn new(options: LandmarkOptions, world: &World, places: &[Se3], cell_m: Option<f64>, dice: &mut Dice) -> Self {
         let lattice = cell_m.map_or_else(|| vec![Vector3::zeros()], |cell_m| shifts(places, cell_m));
         let per_place = options.per_keyframe.div_ceil(lattice.len());

@@ -1,7 +1,7 @@
 //! The world robots drive through: a ground plane, walls with gaps, pillars and boxes of many sizes and orientations,
 //! all drawn from a seed, and a ray-cast range sensor in it. By default no two places look alike; with `aliased`, the
-//! same furnished cell repeats on a lattice, so that one place looks like another, with `aisles` exactly; with `streets`, a
-//! town stands along the robots' paths.
+//! same furnished cell repeats on a lattice, so that one place looks like another, with `aisles` exactly; with
+//! `streets`, a town stands along the robots' paths.
 
 pub mod drive;
 mod generate;
@@ -43,8 +43,8 @@ pub struct WorldOptions {
     pub aliased: bool,
     /// Edge of that cell, m.
     pub cell_m: f64,
-    /// Where the same cell is everywhere: robots drive straight along aisles through cells without end, and nothing that
-    /// they see, where they drive or at the edge, tells one cell from the next.
+    /// Where the same cell is everywhere: robots drive straight along aisles through cells without end, and nothing
+    /// that they see, where they drive or at the edge, tells one cell from the next.
     pub aisles: bool,
     /// Where there are aisles: every cell is a room, with doors where they pass.
     pub rooms: bool,

@@ -46,8 +46,8 @@ impl Path {
         Self::closed(corners.collect())
     }
 
-    /// The aisle of robot `index` through a lattice of cells: two robots share one, in opposite directions, from anywhere
-    /// within its first few cells.
+    /// The aisle of robot `index` through a lattice of cells: two robots share one, in opposite directions, from
+    /// anywhere within its first few cells.
     pub fn of_aisle(index: usize, cell_m: f64, length_m: f64, dice: &mut Dice) -> Self {
         let y = cell_m * ((index / 2) as f64 + 0.5);
         let start = dice.range(0.0, STARTS_CELLS * cell_m);

@@ -1,6 +1,6 @@
-//! A recorded trajectory that simulated robots drive along: lines `stamp x y z qx qy qz qw` (TUM; KITTI's LiDAR poses have
-//! an index for a stamp), packed (`.xz`) or not. Robots drive on flat ground, so only x and y are taken, and the first
-//! point becomes the origin. How the body was turned is not taken either: a robot looks where it drives.
+//! A recorded trajectory that simulated robots drive along: lines `stamp x y z qx qy qz qw` (TUM; KITTI's LiDAR poses
+//! have an index for a stamp), packed (`.xz`) or not. Robots drive on flat ground, so only x and y are taken, and the
+//! first point becomes the origin. How the body was turned is not taken either: a robot looks where it drives.
 
 use super::path::Path;
 use std::io::Read;
@@ -15,7 +15,8 @@ pub const SIDE_MAX_M: f64 = 2_000.0;
 pub const LENGTH_MAX_M: f64 = 50_000.0;
 /// Shortest stretch for one robot, m.
 pub const STRETCH_MIN_M: f64 = 10.0;
-/// Points closer than this to the one before are left out: whoever stands still turns by the noise of his poses alone, m.
+/// Points closer than this to the one before are left out: whoever stands still turns by the noise of his poses alone,
+/// m.
 const STILL_M: f64 = 0.3;
 /// A jump longer than this is no drive, m.
 const JUMP_MAX_M: f64 = 50.0;

@@ -1,9 +1,11 @@
-//! The uncertainty of merged frames does not lie: over seeded runs of a simulated swarm the squared Mahalanobis distance of
-//! every frame's error is compared with the χ² distribution of six degrees of freedom. The night runs enough of them to
-//! judge coverage; the gate runs a few, which tell standard deviations half as large as they should be.
+//! The uncertainty of merged frames does not lie: over seeded runs of a simulated swarm the squared Mahalanobis
+//! distance of every frame's error is compared with the χ² distribution of six degrees of freedom. The night runs
+//! enough of them to judge coverage; the gate runs a few, which tell standard deviations half as large as they should
+//! be.
 //!
-//! That band is one-sided. What alignments of one submap have in common is charged in the consensus of two frames, and their
-//! own covariances are cautious (see the core's `distortion`): estimates may be more certain than they say, never less.
+//! That band is one-sided. What alignments of one submap have in common is charged in the consensus of two frames, and
+//! their own covariances are cautious (see the core's `distortion`): estimates may be more certain than they say, never
+//! less.
 
 use merganser_sim::bench::calibration::{Mean, World, measure};
 use merganser_sim::report::Report;
@@ -89,8 +91,8 @@ fn frames_are_never_merged_wrongly_nor_claimed_better_than_known() {
     assert!(!Calibration::of(&claimed_better).is_honest());
 }
 
-/// Where alignments err as they say, the whole estimate does, through losses, a split and condensed logs; sixty
-/// swarms tell it within some percent (`merganser-sim bench calibration` runs hundreds; of two dozen, whose few numbers are
+/// Where alignments err as they say, the whole estimate does, through losses, a split and condensed logs; sixty swarms
+/// tell it within some percent (`merganser-sim bench calibration` runs hundreds; of two dozen, whose few numbers are
 /// skewed, neither the mean nor its error says much).
 #[test]
 #[ignore = "night: 60 swarms"]
@@ -106,8 +108,8 @@ fn frames_submaps_and_live_poses_are_as_uncertain_as_they_say() {
     }
 }
 
-/// Of five swarms only a lie is told: by degrees of freedom the mean stays below 2, and standard deviations half as large
-/// would raise it above.
+/// Of five swarms only a lie is told: by degrees of freedom the mean stays below 2, and standard deviations half as
+/// large would raise it above.
 #[test]
 fn frames_submaps_and_live_poses_of_few_swarms_are_no_lie() {
     let means = measure(World::Lidar, None, 1..6, || {}).unwrap();

@@ -1,5 +1,5 @@
-//! A swarm that works stays a swarm that works: bad keyframes, mangled messages and a member who signs lies are refused,
-//! counted and reported, and the honest robots' map is what it would have been.
+//! A swarm that works stays a swarm that works: bad keyframes, mangled messages and a member who signs lies are
+//! refused, counted and reported, and the honest robots' map is what it would have been.
 
 use ed25519_dalek::SigningKey;
 use merganser::recording::Recording;
@@ -146,8 +146,8 @@ fn facts(wires: &Wires) -> Vec<(EntryId, Fact)> {
     heard.facts().collect()
 }
 
-/// The facts that mallory signs: submaps that copy alpha's with another trajectory, alignments of them with everybody's,
-/// alignments of alpha with beta that she has no say in, and verdicts on what others measured.
+/// The facts that mallory signs: submaps that copy alpha's with another trajectory, alignments of them with
+/// everybody's, alignments of alpha with beta that she has no say in, and verdicts on what others measured.
 fn lies(honest: &Wires) -> Vec<Vec<u8>> {
     let key = SigningKey::from_bytes(&LIAR_SECRET);
     let name = Name::new(LIAR).unwrap();
@@ -229,7 +229,8 @@ fn a_member_who_signs_lies_moves_nobody_elses_map() {
     assert!(hers.t_own_frame.is_none(), "nobody merges with her");
     let (with, without) = (t_alpha_beta(&lied_to), t_alpha_beta(&honest));
     let moved = (0..3).map(|k| (with.pose.translation[k] - without.pose.translation[k]).abs()).fold(0.0, f64::max);
-    // Her alignments take their turn in the queue, so alpha and beta may try other pairs of theirs, or in another order.
+    // Her alignments take their turn in the queue, so alpha and beta may try other pairs of theirs, or in another
+    // order.
     let sigma = without.sigmas[..3].iter().fold(f64::INFINITY, |least, s| least.min(*s));
     assert!(moved < sigma, "moved by {moved:.4} m, standard deviation {sigma:.4} m");
     assert_eq!(lied_to.agents[0].digest(), lied_to.agents[1].digest());

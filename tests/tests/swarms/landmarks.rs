@@ -1,5 +1,5 @@
-//! Five planar robots among bar codes (MRCLAM), through the importer and the cores on perfect wires: the five end in one
-//! frame, no false alignment is used, and the landmarks of the joint map lie where the survey says.
+//! Five planar robots among bar codes (MRCLAM), through the importer and the cores on perfect wires: the five end in
+//! one frame, no false alignment is used, and the landmarks of the joint map lie where the survey says.
 
 use merganser::demo::trajectory::fit;
 use merganser::demo::views::{pose, relation};
@@ -16,15 +16,15 @@ use std::collections::BTreeMap;
 
 /// Root mean square distance of the landmarks from the survey, at most, m.
 const RMS_MAX: f64 = 0.15;
-/// An alignment is false if it is farther off than this, m and °, from what the survey says of its two submaps, which is
-/// itself known to some centimetres and degrees.
+/// An alignment is false if it is farther off than this, m and °, from what the survey says of its two submaps, which
+/// is itself known to some centimetres and degrees.
 const FALSE: (f64, f64) = (0.5, 10.0);
 /// A landmark of a submap that is this far from the survey, m, is another one whose bar code was misread.
 const MISREAD: f64 = 1.0;
 /// Landmarks without which a submap's place in the survey is not known.
 const PLACED_MIN: usize = 4;
-/// The list of bar codes and the survey disagree about two landmarks, whose names are exchanged in one of them: as printed,
-/// all five robots see each of the two where the other one is, 2.9 m away.
+/// The list of bar codes and the survey disagree about two landmarks, whose names are exchanged in one of them: as
+/// printed, all five robots see each of the two where the other one is, 2.9 m away.
 const EXCHANGED: [u32; 2] = [18, 61];
 
 /// Where the survey has each bar code.

@@ -12,8 +12,8 @@ use merganser_tests::wires::play;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 
-/// Relations of two robots are off by so much at most, m and °. They are themselves not exact: a tenth of those over which
-/// one robot's own way closes are 0.10 m or 1.8° off from the map that fits them best, the worst 0.25 m and 3.5°.
+/// Relations of two robots are off by so much at most, m and °. They are themselves not exact: a tenth of those over
+/// which one robot's own way closes are 0.10 m or 1.8° off from the map that fits them best, the worst 0.25 m and 3.5°.
 const WORST: (f64, f64) = (0.5, 6.0);
 /// Half of them by so much.
 const MEDIAN: (f64, f64) = (0.10, 1.5);

@@ -1,5 +1,5 @@
-//! Real depth images through the importer and the cores, on perfect wires: what the estimate is worth when no message is
-//! lost, and a function of the data and the seed of the drift alone.
+//! Real depth images through the importer and the cores, on perfect wires: what the estimate is worth when no message
+//! is lost, and a function of the data and the seed of the drift alone.
 
 use merganser::demo::evaluate::{Bounds, CHI2_6_95, Evaluation, evaluate};
 use merganser::demo::track::Track;

@@ -1,6 +1,6 @@
-//! Robots with one camera each, whose SLAMs measure in units that nobody knows (SIM(3)), end in one map: with their scales
-//! right, their uncertainty honest, and their own loops in it; beside one that knows the metre, over a bad radio, with a
-//! crash and a SLAM that begins anew. Where everything looks alike, nothing merges.
+//! Robots with one camera each, whose SLAMs measure in units that nobody knows (SIM(3)), end in one map: with their
+//! scales right, their uncertainty honest, and their own loops in it; beside one that knows the metre, over a bad
+//! radio, with a crash and a SLAM that begins anew. Where everything looks alike, nothing merges.
 
 use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::Event;
@@ -91,8 +91,8 @@ fn shelves_that_look_alike_are_not_merged_wrongly() {
     }
 }
 
-/// From within one of many equal cells nobody can tell them apart at first. Who has been in two of them can, and tells all:
-/// whoever it was taken for a neighbour of parts from it.
+/// From within one of many equal cells nobody can tell them apart at first. Who has been in two of them can, and tells
+/// all: whoever it was taken for a neighbour of parts from it.
 #[test]
 fn who_has_seen_its_own_place_repeat_merges_with_nobody_for_long() {
     repeats_are_seen(&[4]);

@@ -1,14 +1,14 @@
-//! What stands in for a robot's own SLAM. Of the sightings of each bar code every other one makes the odometry, with the
-//! commanded speeds; the others are handed over in the keyframes. So the odometry knows nothing of what the alignments are
-//! made of, and nothing counts twice.
+//! What stands in for a robot's own SLAM. Of the sightings of each bar code every other one makes the odometry, with
+//! the commanded speeds; the others are handed over in the keyframes. So the odometry knows nothing of what the
+//! alignments are made of, and nothing counts twice.
 //!
-//! A filter (EKF) goes over the log first. Its frame is the last keyframe's body (robocentric, Castellanos et al. 2007): it
-//! holds the way since then, the landmarks about it, and by how much speeds and turns differ from the commanded ones. These
-//! last two are a robot's own and do not change; a first run finds them, a second one begins with them, cuts keyframes and
-//! leaves out misread bar codes. Then `smooth` refines all keyframes at once.
+//! A filter (EKF) goes over the log first. Its frame is the last keyframe's body (robocentric, Castellanos et al.
+//! 2007): it holds the way since then, the landmarks about it, and by how much speeds and turns differ from the
+//! commanded ones. These last two are a robot's own and do not change; a first run finds them, a second one begins with
+//! them, cuts keyframes and leaves out misread bar codes. Then `smooth` refines all keyframes at once.
 //!
-//! Motions of consecutive keyframes are stated as independent. They are not: landmarks that are seen again tie them together,
-//! so the way over many of them is known better than stated.
+//! Motions of consecutive keyframes are stated as independent. They are not: landmarks that are seen again tie them
+//! together, so the way over many of them is known better than stated.
 
 use super::smooth::{Node, Seen, between, smooth};
 use super::{Sighting, Speed};
@@ -33,9 +33,9 @@ const ACROSS: f64 = 0.03 * 0.03;
 const HEADING_PER_M: f64 = 0.06 * 0.06;
 /// ...and per rad turned.
 const HEADING_PER_RAD: f64 = 0.14 * 0.14;
-/// Standard deviation of a range: at hand, and more with its square (per m). Single ones scatter by half of that, but what is
-/// wrong with them stays so for as long as a landmark is in sight: with these, the constellations of submaps differ from the
-/// survey as they say they do...
+/// Standard deviation of a range: at hand, and more with its square (per m). Single ones scatter by half of that, but
+/// what is wrong with them stays so for as long as a landmark is in sight: with these, the constellations of submaps
+/// differ from the survey as they say they do...
 const RANGE: (f64, f64) = (0.12, 0.016);
 /// ...and of a bearing, rad.
 const BEARING: f64 = 0.05;
@@ -78,8 +78,8 @@ impl Calibration {
     }
 }
 
-/// The keyframes of one robot's log in a frame that begins where it first saw something. `sightings` are those of landmarks
-/// only.
+/// The keyframes of one robot's log in a frame that begins where it first saw something. `sightings` are those of
+/// landmarks only.
 pub fn keyframes(speeds: &[Speed], sightings: &[Sighting]) -> Vec<Keyframe> {
     let mut filter = Filter::new(Calibration::of(speeds, sightings), SCALES.1);
     let (mut stamps, mut nodes, mut handed) = (Vec::<Stamp>::new(), Vec::<Node>::new(), Vec::new());
@@ -296,8 +296,8 @@ impl Filter {
         self.p = &left * &self.p * left.transpose() + &gain * noise(sighting) * gain.transpose();
     }
 
-    /// How a sighting of a known landmark differs from what the state lets expect; `None` if it contradicts that, or the
-    /// landmark is not known.
+    /// How a sighting of a known landmark differs from what the state lets expect; `None` if it contradicts that, or
+    /// the landmark is not known.
     fn expected(&self, sighting: &Sighting) -> Option<Expected> {
         let at = *self.places.get(&sighting.barcode)?;
         let off = Vector2::new(self.x[at] - self.x[0], self.x[at + 1] - self.x[1]);

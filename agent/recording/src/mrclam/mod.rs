@@ -1,9 +1,9 @@
-//! The logs of the MRCLAM data sets (Leung et al., IJRR 2011): robots that drive in a plane, their commanded speeds, and range
-//! and bearing to bar codes, which landmarks and robots carry. Pure text: the caller reads the files.
+//! The logs of the MRCLAM data sets (Leung et al., IJRR 2011): robots that drive in a plane, their commanded speeds,
+//! and range and bearing to bar codes, which landmarks and robots carry. Pure text: the caller reads the files.
 //!
-//! A line holds numbers: `time forward_velocity angular_velocity` (s, m/s, rad/s) in an odometry file, `time barcode range
-//! bearing` (s, m, rad) in a measurement file, `subject barcode` in `Barcodes.dat`, where robots are the first subjects. What
-//! begins with `#` is a remark.
+//! A line holds numbers: `time forward_velocity angular_velocity` (s, m/s, rad/s) in an odometry file, `time barcode
+//! range bearing` (s, m, rad) in a measurement file, `subject barcode` in `Barcodes.dat`, where robots are the first
+//! subjects. What begins with `#` is a remark.
 //!
 //! `front` and `smooth` stand in for the robots' own SLAM.
 

@@ -1,6 +1,6 @@
-//! The poses of all keyframes and the places of all landmarks at once, by least squares: what a SLAM comes to that keeps
-//! refining its keyframes. Poses form a chain, and there are few landmarks: the normal equations are block tridiagonal with
-//! a border, are solved pose by pose, and their inverse is wanted for neighbours only.
+//! The poses of all keyframes and the places of all landmarks at once, by least squares: what a SLAM comes to that
+//! keeps refining its keyframes. Poses form a chain, and there are few landmarks: the normal equations are block
+//! tridiagonal with a border, are solved pose by pose, and their inverse is wanted for neighbours only.
 
 use libm::{atan2, cos, sin};
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Matrix3x2, Matrix3xX, Vector2, Vector3};
@@ -48,8 +48,8 @@ struct Part {
     gradient: Vector3<f64>,
 }
 
-/// Moves the poses to the least-squares solution; gives back, for each but the first, the covariance of the way to it from
-/// the one before in that one's axes. `None` if there is no solution.
+/// Moves the poses to the least-squares solution; gives back, for each but the first, the covariance of the way to it
+/// from the one before in that one's axes. `None` if there is no solution.
 pub fn smooth(nodes: &mut [Node]) -> Option<Vec<Matrix3<f64>>> {
     let mut places: BTreeMap<u32, Vector2<f64>> = BTreeMap::new();
     for node in nodes.iter() {
@@ -130,8 +130,8 @@ fn normal(nodes: &[Node], places: &BTreeMap<u32, Vector2<f64>>) -> Option<(Vec<P
     Some((parts, d, g))
 }
 
-/// Of the ways between neighbours, from the last to the first: the blocks of the inverse that belong to a pose, the one after
-/// it and the landmarks follow from those of the one after it.
+/// Of the ways between neighbours, from the last to the first: the blocks of the inverse that belong to a pose, the one
+/// after it and the landmarks follow from those of the one after it.
 fn covariances(nodes: &[Node], parts: &[Part], landmarks: DMatrix<f64>) -> Option<Vec<Matrix3<f64>>> {
     let mut ways = Vec::new();
     let (mut own, mut with) = (Matrix3::zeros(), Matrix3xX::<f64>::zeros(landmarks.nrows()));

@@ -1,5 +1,6 @@
 //! Exact maximum clique of a small graph, by branch and bound with greedy colouring (Tomita & Seki 2003): the largest
-//! set of alignments that all agree pairwise. Vertices are visited in a fixed order, so equal graphs give equal cliques.
+//! set of alignments that all agree pairwise. Vertices are visited in a fixed order, so equal graphs give equal
+//! cliques.
 
 /// Vertices at most: one bit each.
 pub(super) const VERTICES_MAX: usize = 128;

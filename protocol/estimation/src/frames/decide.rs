@@ -14,7 +14,8 @@ use crate::geometry::Covariance;
 
 /// A rival with this share of the best set's members makes the frames ambiguous.
 const RIVAL_SHARE: f64 = 0.8;
-/// One more gate, for candidates only: so much beyond the widest that a truth which chance stretched is still found whole.
+/// One more gate, for candidates only: so much beyond the widest that a truth which chance stretched is still found
+/// whole.
 const REACH: f64 = 1.3;
 /// Doubtful members leave the answer open if the other frame's map is to be expected off, should they be false, by more
 /// than this share of an alignment's reach.
@@ -56,8 +57,8 @@ impl<const N: usize, G: Scaled<N>> Measured<'_, N, G> {
         }
     }
 
-    /// As many as are wanted, and, where one alone would not do, of more than one submap on either side: what one submap
-    /// alone says, however often it is asked, may be said of a place that only looks the same.
+    /// As many as are wanted, and, where one alone would not do, of more than one submap on either side: what one
+    /// submap alone says, however often it is asked, may be said of a place that only looks the same.
     fn suffices(&self, set: Set) -> bool {
         let distinct = |of: fn(&Alignment<N, G>) -> usize| {
             let mut submaps: Vec<usize> = clique::vertices(set).map(|k| of(&self.alignments[k])).collect();
@@ -69,8 +70,8 @@ impl<const N: usize, G: Scaled<N>> Measured<'_, N, G> {
         set.count_ones() as usize >= wanted && distinct(|x| x.i).min(distinct(|x| x.j)) >= wanted.min(SUBMAPS_MIN)
     }
 
-    /// `best` without its doubtful members, and that it is certain; or with them, and that it is not, where too few would be
-    /// left or too much hangs on them. Its covariance reckons with the doubt that remains.
+    /// `best` without its doubtful members, and that it is certain; or with them, and that it is not, where too few
+    /// would be left or too much hangs on them. Its covariance reckons with the doubt that remains.
     fn beyond_doubt(
         &self,
         pairs: &Pairs,

@@ -3,11 +3,12 @@
 //! Evidence weighs a member against chance spread evenly over the search volume. False alignments crowd where true ones
 //! are (robots that know the vertical, places that look alike because they are near): *measured* over 28,000 worlds of
 //! `merganser-sim bench frames`, about [`NEAR_MISSES`] times as densely. With the share of the others in the place of a
-//! prior, a member that adds g to the evidence of a set of k among n is false with odds NEAR_MISSES (n − k + ½) / k e^(−g);
-//! in these worlds the odds hold within a factor of two from g = 8 to 12.
+//! prior, a member that adds g to the evidence of a set of k among n is false with odds NEAR_MISSES (n − k + ½) / k
+//! e^(−g); in these worlds the odds hold within a factor of two from g = 8 to 12.
 //!
-//! What is merged wrongly looks alike: true alignments crowd in a short stretch, so that they predict little elsewhere, and
-//! a near miss elsewhere, which passes every gate because they do, turns the whole. So no merge hangs on a doubtful member.
+//! What is merged wrongly looks alike: true alignments crowd in a short stretch, so that they predict little elsewhere,
+//! and a near miss elsewhere, which passes every gate because they do, turns the whole. So no merge hangs on a doubtful
+//! member.
 
 use super::clique::{self, Set, bit};
 use super::evidence::Evidence;
@@ -83,7 +84,8 @@ fn solve<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, pairs: &Pa
     Gls::solve(measured, set, hypothesis::start(measured, pairs, set, hub)?)
 }
 
-/// How far apart two T_αβ lay β's map, α's units: its middle, and an anchor at a typical distance, turned about any axis.
+/// How far apart two T_αβ lay β's map, α's units: its middle, and an anchor at a typical distance, turned about any
+/// axis.
 fn shift<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, a: &G, b: &G) -> f64 {
     let anchors = || (0..measured.beta.len()).filter_map(|k| measured.beta.pose(k)).map(|pose| pose.translation);
     let count = measured.beta.len().max(1) as f64;

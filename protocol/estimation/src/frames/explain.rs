@@ -1,10 +1,10 @@
 //! The explanation of all alignments that has the most evidence: one set that speaks of one transform, or two that
 //! speak of two (a truth and a lie, whichever is which), the rest being chance.
 //!
-//! Evidence cannot tell which of two sets is the truth, since an explanation has them both; only their sizes can. It does
-//! tell a blend of both from the two apart, whose a member is where both would have it, and whether an alignment just
-//! outside a gate is a member: where the prediction is sharp, chance seldom comes near and a wide gate is right; where it is
-//! loose, a narrow one.
+//! Evidence cannot tell which of two sets is the truth, since an explanation has them both; only their sizes can. It
+//! does tell a blend of both from the two apart, whose a member is where both would have it, and whether an alignment
+//! just outside a gate is a member: where the prediction is sharp, chance seldom comes near and a wide gate is right;
+//! where it is loose, a narrow one.
 
 use super::clique::{self, Set, bit};
 use super::evidence::Evidence;

@@ -23,7 +23,8 @@ pub(super) struct Gls<const N: usize, G> {
     pub(super) chi_squared: f64,
     /// Its degrees of freedom: all values measured less those of T_αβ.
     pub(super) freedom: usize,
-    /// ln √(|C| |Jᵀ C⁻¹ J|), of the residuals' covariance C: what the residuals' density and the freedom to choose T_αβ cost.
+    /// ln √(|C| |Jᵀ C⁻¹ J|), of the residuals' covariance C: what the residuals' density and the freedom to choose T_αβ
+    /// cost.
     pub(super) log_sqrt_det: f64,
     /// Each member as the others predict it, in the set's order. Empty for a single member.
     pub(super) left_out: Vec<LeftOut>,
@@ -39,8 +40,8 @@ pub(super) struct LeftOut {
 }
 
 impl<const N: usize, G: Scaled<N>> Gls<N, G> {
-    /// χ² without a member of `dimension` values that lies `distance_squared` from what the others predict, and its degrees
-    /// of freedom.
+    /// χ² without a member of `dimension` values that lies `distance_squared` from what the others predict, and its
+    /// degrees of freedom.
     pub(super) fn others(&self, distance_squared: f64, dimension: usize) -> (f64, f64) {
         ((self.chi_squared - distance_squared).max(0.0), self.freedom.saturating_sub(dimension) as f64)
     }

@@ -1,4 +1,5 @@
-//! One explanation of the alignments: a set that agrees, what it says of T_αβ, and how unlikely chance is to do as well.
+//! One explanation of the alignments: a set that agrees, what it says of T_αβ, and how unlikely chance is to do as
+//! well.
 
 use super::FrameConsensus;
 use super::clique::{self, Set, bit};

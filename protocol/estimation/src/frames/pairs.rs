@@ -71,10 +71,10 @@ impl Pairs {
 
     /// Log₁₀ of the number of false alarms of `set`, and the member it is counted from.
     ///
-    /// Under chance a residual falls evenly into the search volume; it comes as near to a hypothesis as the set's worst member does
-    /// with the probability α of that ellipsoid. NFA = n (n − 1) C(n − 1, k) Π α over the k other members (n hypotheses,
-    /// n − 1 radii); the smallest over members as hypotheses. No set counts as nearer than true alignments are on average,
-    /// d² = N, so that one alignment told many times proves little.
+    /// Under chance a residual falls evenly into the search volume; it comes as near to a hypothesis as the set's worst
+    /// member does with the probability α of that ellipsoid. NFA = n (n − 1) C(n − 1, k) Π α over the k other members
+    /// (n hypotheses, n − 1 radii); the smallest over members as hypotheses. No set counts as nearer than true
+    /// alignments are on average, d² = N, so that one alignment told many times proves little.
     pub(super) fn log10_nfa<const N: usize, G: Scaled<N>>(
         &self,
         measured: &Measured<'_, N, G>,

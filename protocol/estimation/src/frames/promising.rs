@@ -1,5 +1,5 @@
-//! Which of many alignments a consensus should weigh: decides by pairwise agreement, which is cheap, before anything that
-//! costs the cube of their number.
+//! Which of many alignments a consensus should weigh: decides by pairwise agreement, which is cheap, before anything
+//! that costs the cube of their number.
 
 use super::clique::{self, Set, bit};
 use super::measured::Measured;
@@ -8,8 +8,8 @@ use super::{FrameConsensusConfig, PairAlignment, gate};
 use crate::geometry::Se3;
 use crate::trajectory::Trajectory;
 
-/// Disjoint groups of agreeing alignments that are kept in proportion: the first may be the truth, and the others must be
-/// seen as rivals to it.
+/// Disjoint groups of agreeing alignments that are kept in proportion: the first may be the truth, and the others must
+/// be seen as rivals to it.
 const GROUPS_MAX: usize = 4;
 
 /// Positions of at most `most` alignments: of the largest groups that agree pairwise, evenly, and if there is room, of

@@ -1,8 +1,8 @@
-//! Scale from baselines (MATH §5, last line). An alignment of similar frames need not measure scale: it may place a submap
-//! of β, whose unit is unknown, in a submap of α by rotation and translation in α's unit alone. Two such then give
-//! s = |Δp_α| / |Δp_β|: the distance of their places in α over that of the same places in β, as far as both distances
-//! exceed their uncertainty. Everywhere else such an alignment is one whose log-scale is as uncertain as chance leaves it,
-//! taken at the scale under which it is tested.
+//! Scale from baselines (MATH §5, last line). An alignment of similar frames need not measure scale: it may place a
+//! submap of β, whose unit is unknown, in a submap of α by rotation and translation in α's unit alone. Two such then
+//! give s = |Δp_α| / |Δp_β|: the distance of their places in α over that of the same places in β, as far as both
+//! distances exceed their uncertainty. Everywhere else such an alignment is one whose log-scale is as uncertain as
+//! chance leaves it, taken at the scale under which it is tested.
 
 use super::measured::Alignment;
 use crate::geometry::{Covariance, Group, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3};
@@ -14,8 +14,8 @@ pub(super) const LOG_SCALE_RANGE: f64 = 5.991_464_547_107_982;
 /// ln 400 / √(2π): a Gaussian of this width is as dense at its middle as chance is over the whole range, so that an
 /// unmeasured scale counts neither for nor against an alignment.
 const UNMEASURED_LOG_SCALE_SIGMA: f64 = 2.390_248_529_367_596;
-/// Largest standard deviation of log-scale that counts as measured: at 3σ a length is then wrong by a third at most, and
-/// the first-order propagation holds.
+/// Largest standard deviation of log-scale that counts as measured: at 3σ a length is then wrong by a third at most,
+/// and the first-order propagation holds.
 pub(super) const LOG_SCALE_SIGMA_MAX: f64 = 0.1;
 
 /// A measurement between two frames of which at least one has unknown scale.
@@ -23,8 +23,8 @@ pub(super) const LOG_SCALE_SIGMA_MAX: f64 = 0.1;
 pub enum SimMeasurement {
     /// Measures scale too.
     Scaled(SimWithCovariance),
-    /// Rotation, and translation in α's unit (so is its covariance); the scale of β is not measured. For one in β's unit,
-    /// swap the frames.
+    /// Rotation, and translation in α's unit (so is its covariance); the scale of β is not measured. For one in β's
+    /// unit, swap the frames.
     Unscaled(PoseWithCovariance),
 }
 
@@ -95,8 +95,8 @@ impl Scaled<7> for Sim3 {
 }
 
 impl<const N: usize, G: Scaled<N>> Alignment<N, G> {
-    /// The measurement and its covariance where the frames' scale is `scale`. An unscaled one keeps its translation; the
-    /// perturbation that moves it is in units of β, hence 1/`scale` as large.
+    /// The measurement and its covariance where the frames' scale is `scale`. An unscaled one keeps its translation;
+    /// the perturbation that moves it is in units of β, hence 1/`scale` as large.
     pub(super) fn at(&self, scale: f64) -> (G, SMatrix<f64, N, N>) {
         let mut m = *self.covariance.matrix();
         if self.measures_scale {

@@ -275,8 +275,8 @@ fn frames_of_unknown_scale_merge_with_their_scale() {
     assert!((5.5..8.5).contains(&anees), "ANEES {anees} of 7");
 }
 
-/// Over seeded worlds of which no alignment measures scale: right merges with the truth inside the 95 % ellipsoid, right
-/// merges, wrong ones, refusals for want of a baseline; and the mean squared normalised error.
+/// Over seeded worlds of which no alignment measures scale: right merges with the truth inside the 95 % ellipsoid,
+/// right merges, wrong ones, refusals for want of a baseline; and the mean squared normalised error.
 fn unscaled(draw: Draw, seeds: core::ops::Range<u64>) -> ([u32; 4], f64) {
     let (mut counts, mut sum) = ([0; 4], 0.0);
     for seed in seeds {

@@ -1,10 +1,10 @@
 //! The joint estimate as it grows: decides what a new fact touches, and solves for no more than that.
 //!
 //! A component's factorisation is kept as a tree of fronts (the `sparse` module). A new factor dissolves the fronts on
-//! the ways from its anchors to the root, and only they are eliminated anew; the solution moves only where it changes by
-//! a share of its standard deviation; factors are linearised anew only where the linear model has aged (`model`). This is
-//! iSAM2 (Kaess et al. 2012) with limits in standard deviations, so that they hold for any unit, and with new anchors
-//! hung below known ones at no further cost while a single rigid factor ties them, as odometry does.
+//! the ways from its anchors to the root, and only they are eliminated anew; the solution moves only where it changes
+//! by a share of its standard deviation; factors are linearised anew only where the linear model has aged (`model`).
+//! This is iSAM2 (Kaess et al. 2012) with limits in standard deviations, so that they hold for any unit, and with new
+//! anchors hung below known ones at no further cost while a single rigid factor ties them, as odometry does.
 //!
 //! The tests hold every estimate within 0.05 standard deviations of [`super::solve::solve`]'s, and within 1e-5 after
 //! [`Incremental::settle`]. The anchor held fixed is that of the solution it grew from. The same additions in the same
@@ -214,8 +214,8 @@ impl Incremental {
         })
     }
 
-    /// `t_i_j` between two anchors with the covariance of its local perturbation, as [`Solution::relative`] has it, drawn
-    /// at the linearisation points. `None` for anchors that are not here.
+    /// `t_i_j` between two anchors with the covariance of its local perturbation, as [`Solution::relative`] has it,
+    /// drawn at the linearisation points. `None` for anchors that are not here.
     pub fn relative(&self, i: SubmapId, j: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Option<Relative> {
         let model = &self.model;
         let (a, b) = (*model.index.get(&i)?, *model.index.get(&j)?);

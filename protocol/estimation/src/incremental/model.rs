@@ -171,8 +171,8 @@ impl Model {
         edges.into_iter().collect()
     }
 
-    /// Moves the linearisation points of `nodes` to their estimates, and those of their frames where the scale has moved.
-    /// Returns all whose point moved, ascending.
+    /// Moves the linearisation points of `nodes` to their estimates, and those of their frames where the scale has
+    /// moved. Returns all whose point moved, ascending.
     pub(super) fn relinearise(&mut self, tree: &mut CliqueTree, nodes: &[usize]) -> Vec<usize> {
         let mut all: BTreeSet<usize> = nodes.iter().copied().collect();
         let frames: BTreeSet<FrameId> = nodes.iter().map(|&node| self.nodes[node].id.frame).collect();
@@ -189,8 +189,8 @@ impl Model {
         all.into_iter().collect()
     }
 
-    /// What [`Model::defect`] cannot much exceed, at a tenth of its cost: the terms of second order, each as large as it
-    /// can be. `None` where scales moved.
+    /// What [`Model::defect`] cannot much exceed, at a tenth of its cost: the terms of second order, each as large as
+    /// it can be. `None` where scales moved.
     pub(super) fn defect_bound(&self, tree: &CliqueTree, edge: &Edge) -> Option<f64> {
         let ((rho_i, phi_i, scale_i), (rho_j, phi_j, scale_j)) = (self.delta(tree, edge.i), self.delta(tree, edge.j));
         if scale_i != 0.0 || scale_j != 0.0 {

@@ -240,8 +240,8 @@ impl Parser {
     }
 }
 
-/// What tells a measurement from others: half a BLAKE3 hash of its ends and numbers. A file may hold any number between the
-/// same two poses.
+/// What tells a measurement from others: half a BLAKE3 hash of its ends and numbers. A file may hold any number between
+/// the same two poses.
 fn digest(ends: [u64; 2], t_i_j: &Se3, information: &Matrix6<f64>) -> [u8; 16] {
     let (at, turn) = (t_i_j.translation, t_i_j.rotation.xyzw());
     let numbers = at.iter().chain(&turn).chain(information).copied();

@@ -1,7 +1,8 @@
 //! Kimera-Multi's measurement tables (`measurements.csv`, one a robot): decides which rows make a sound pose graph.
 //!
 //! Columns, by name: `robot_src, pose_src, robot_dst, pose_dst, qx, qy, qz, qw, tx, ty, tz, kappa, tau`, and optionally
-//! `is_known_inlier, weight`. A pose becomes the g2o id with the robot's letter in the top byte, as GTSAM's symbols are.
+//! `is_known_inlier, weight`. A pose becomes the g2o id with the robot's letter in the top byte, as GTSAM's symbols
+//! are.
 
 use super::lines::{Files, without_mark};
 use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_information, printed_matrix};

@@ -2,8 +2,9 @@
 //! together whose makers may have used the same measurements.
 //!
 //! Columns: `id, origin, x, y, z, qx, qy, qz, qw`, then the upper triangle of the covariance of the local perturbation
-//! (ρ, φ), row by row, `c11` to `c66`. It is the pose's covariance given where `origin` is, a pose of the same connected
-//! part, which therefore tells parts apart. Lengths are metres, angles radians; lines that begin with `#` are comments.
+//! (ρ, φ), row by row, `c11` to `c66`. It is the pose's covariance given where `origin` is, a pose of the same
+//! connected part, which therefore tells parts apart. Lengths are metres, angles radians; lines that begin with `#` are
+//! comments.
 
 use super::POSES_MAX;
 use super::fault::PoseName;

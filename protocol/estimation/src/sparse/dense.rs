@@ -1,5 +1,5 @@
-//! The dense kernels of one front: faer's, on column-major panels. They follow the processor's vector units, so that two
-//! kinds of processor agree to rounding and not to the bit (DESIGN §7 asks 1e-9); on one kind they do, to the bit.
+//! The dense kernels of one front: faer's, on column-major panels. They follow the processor's vector units, so that
+//! two kinds of processor agree to rounding and not to the bit (DESIGN §7 asks 1e-9); on one kind they do, to the bit.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{LltError, LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
@@ -53,8 +53,8 @@ impl Panel<'_> {
 }
 
 /// From the panel of a factor, `L` and `B`, and `z_below`, the dense square of `H⁻¹` at the rows below: the panel of
-/// `H⁻¹`, whose rows below are `−Z_below W` with `W = B L⁻¹` and whose square is `L⁻ᵀ L⁻¹ − Wᵀ (−Z_below W)`. Leaves `W`
-/// and `L⁻¹` in `panel`.
+/// `H⁻¹`, whose rows below are `−Z_below W` with `W = B L⁻¹` and whose square is `L⁻ᵀ L⁻¹ − Wᵀ (−Z_below W)`. Leaves
+/// `W` and `L⁻¹` in `panel`.
 pub(super) fn invert(panel: &mut Panel<'_>, z_below: &[f64], out: &mut [f64]) {
     let (height, columns) = (panel.height, panel.columns);
     let depth = height - columns;

@@ -40,7 +40,8 @@ impl BlockPattern {
     /// Factorises `H = L Lᵀ`.
     ///
     /// # Errors
-    /// [`SolveError::Underconstrained`] with the variable at which a pivot is not positive; [`SolveError::OutOfMemory`].
+    /// [`SolveError::Underconstrained`] with the variable at which a pivot is not positive;
+    /// [`SolveError::OutOfMemory`].
     pub(crate) fn factorise(&self, h: Vec<f64>, space: &mut Workspace) -> Result<Factor, SolveError> {
         let mut values = h;
         let Workspace { updates, scratch } = space;
@@ -102,8 +103,8 @@ impl BlockPattern {
 }
 
 impl BlockPattern {
-    /// Replaces each of the right-hand sides that follow one another in `b`, zero but at `scalars`, by `L⁻¹ b`: only the
-    /// fronts from those scalars up to the root are touched. Returns the scalars that may not be zero now.
+    /// Replaces each of the right-hand sides that follow one another in `b`, zero but at `scalars`, by `L⁻¹ b`: only
+    /// the fronts from those scalars up to the root are touched. Returns the scalars that may not be zero now.
     pub(crate) fn solve_upwards(
         &self,
         factor: &Factor,

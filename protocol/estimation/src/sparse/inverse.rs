@@ -5,8 +5,8 @@ use super::dense::{self, Panel};
 use super::{BlockPattern, Factor, Front};
 use core::cmp::Ordering;
 
-/// Blocks of `H⁻¹`. The whole panels would take as much again as the factor; those that ask want the blocks that `H` has,
-/// or fewer.
+/// Blocks of `H⁻¹`. The whole panels would take as much again as the factor; those that ask want the blocks that `H`
+/// has, or fewer.
 #[derive(Debug)]
 pub(crate) struct SelectedInverse<'a> {
     pattern: &'a BlockPattern,

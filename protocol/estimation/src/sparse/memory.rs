@@ -1,15 +1,16 @@
-//! What a factorisation will take, counted from the pattern alone: decides which maps are too densely tied to be solved.
+//! What a factorisation will take, counted from the pattern alone: decides which maps are too densely tied to be
+//! solved.
 //!
-//! Where everything is tied to everything, the factor is a dense matrix: that of 5,000 poses takes 7 GB. A process that asks
-//! for more than there is gets killed, whoever sent the map; so the bytes are counted before any are asked for. Counting
-//! saturates, and what saturates is refused.
+//! Where everything is tied to everything, the factor is a dense matrix: that of 5,000 poses takes 7 GB. A process that
+//! asks for more than there is gets killed, whoever sent the map; so the bytes are counted before any are asked for.
+//! Counting saturates, and what saturates is refused.
 
 use super::order::Elimination;
 use crate::solve::SolveError;
 
-/// Bytes that solving one component may take: its factor twice (the inverse is drawn from panels of its own, which may be
-/// as many), with the updates on the stack or what the inverse keeps and works on beside. For whoever solves a
-/// graph of his own; an agent, whose map others write, takes less ([`solve_map`](crate::solve_map)).
+/// Bytes that solving one component may take: its factor twice (the inverse is drawn from panels of its own, which may
+/// be as many), with the updates on the stack or what the inverse keeps and works on beside. For whoever solves a graph
+/// of his own; an agent, whose map others write, takes less ([`solve_map`](crate::solve_map)).
 pub const FACTOR_BYTES_MAX: u64 = 4 << 30;
 
 /// So many numbers are kept for each of the factor.

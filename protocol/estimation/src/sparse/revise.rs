@@ -21,8 +21,8 @@ struct Top {
 }
 
 impl CliqueTree {
-    /// Eliminates anew what a change of terms touches: the cliques of the variables `touched`, those that hold the terms
-    /// `dirty`, and all above; with `new_variables` and `new_terms`. Returns the number of cliques eliminated.
+    /// Eliminates anew what a change of terms touches: the cliques of the variables `touched`, those that hold the
+    /// terms `dirty`, and all above; with `new_variables` and `new_terms`. Returns the number of cliques eliminated.
     ///
     /// # Errors
     /// [`SolveError`]; nothing has changed then.

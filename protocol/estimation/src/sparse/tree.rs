@@ -1,9 +1,9 @@
 //! A factorisation that grows: decides which fronts a new term touches, and eliminates those again.
 //!
 //! The fronts form a tree; what a front passes to its parent is kept. A change of a term touches the front that holds
-//! it and the fronts above: these are dissolved, their variables ordered and eliminated anew, and the untouched subtrees
-//! hung below again (Kaess et al. 2012, "iSAM2", §3). A new variable that one term alone ties to known ones, and fully,
-//! passes nothing on: it is hung below them and nothing else is touched.
+//! it and the fronts above: these are dissolved, their variables ordered and eliminated anew, and the untouched
+//! subtrees hung below again (Kaess et al. 2012, "iSAM2", §3). A new variable that one term alone ties to known ones,
+//! and fully, passes nothing on: it is hung below them and nothing else is touched.
 //!
 //! What is dissolved is kept until [`CliqueTree::accept`], so that [`CliqueTree::reject`] leaves no trace.
 
@@ -173,8 +173,8 @@ impl CliqueTree {
         (0..self.sizes.len()).filter(|&v| self.clique_of[v] != NONE).collect()
     }
 
-    /// `Aᵀ H⁻¹ A` for seven columns A that are zero but in the rows given as (variable, scalar of it, row): the square of
-    /// `L⁻¹ A`, which is zero off the ways from those variables to the roots.
+    /// `Aᵀ H⁻¹ A` for seven columns A that are zero but in the rows given as (variable, scalar of it, row): the square
+    /// of `L⁻¹ A`, which is zero off the ways from those variables to the roots.
     pub(crate) fn covariance(&self, rows: &[(usize, usize, Vector7)]) -> Matrix7 {
         let n = self.scalars();
         let mut columns = vec![0.0; 7 * n];
@@ -240,8 +240,9 @@ impl CliqueTree {
         Ok(true)
     }
 
-    /// Solves `H x = b` where it may have changed: in new cliques, and below variables that moved. A variable that would
-    /// move by less than `tolerance` of its standard deviation given the later ones stays. Returns those that moved.
+    /// Solves `H x = b` where it may have changed: in new cliques, and below variables that moved. A variable that
+    /// would move by less than `tolerance` of its standard deviation given the later ones stays. Returns those that
+    /// moved.
     pub(crate) fn substitute(&mut self, tolerance: f64) -> Vec<usize> {
         let mut moved = Vec::new();
         let mut has_moved = vec![false; self.sizes.len()];

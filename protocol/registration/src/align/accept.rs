@@ -1,13 +1,14 @@
-//! Whether a consensus could be chance: the number of false alarms (NFA), the expected number of equally good alignments
-//! in random matches (MATH §4.3).
+//! Whether a consensus could be chance: the number of false alarms (NFA), the expected number of equally good
+//! alignments in random matches (MATH §4.3).
 //!
-//! `NFA = (k − 3)(k − 2) C(n, k) π₃ α^(k − 3)`: α is the chance that a random target lies within the k-th smallest residual of
-//! a given place, and π₃ the chance that a random triangle is rigid to that accuracy at all; both are measured on the
-//! problem ([`super::chance`]). With covariances a match's region is an ellipsoid; the mean volume of all matches' at the
-//! same Mahalanobis distance takes the sphere's place (of products over subsets the power of the mean is the upper bound).
-//! It counts as the sphere of that volume for α, and of the ellipsoids' largest axes for π₃. The first factors share the false alarms out among the k tried: Σ 1/((k − 3)(k − 2)) is 1 from
-//! k = 4 on, as is the sum of MATH's 1/(n − 3) over all k, but a small consensus is the one in doubt. MATH's C(k, 3) is absent: it counts each subset once for each of its triangles. Evidence is
-//! not used: on pure outliers it accepts 76–100 % (*measured*).
+//! `NFA = (k − 3)(k − 2) C(n, k) π₃ α^(k − 3)`: α is the chance that a random target lies within the k-th smallest
+//! residual of a given place, and π₃ the chance that a random triangle is rigid to that accuracy at all; both are
+//! measured on the problem ([`super::chance`]). With covariances a match's region is an ellipsoid; the mean volume of
+//! all matches' at the same Mahalanobis distance takes the sphere's place (of products over subsets the power of the
+//! mean is the upper bound). It counts as the sphere of that volume for α, and of the ellipsoids' largest axes for π₃.
+//! The first factors share the false alarms out among the k tried: Σ 1/((k − 3)(k − 2)) is 1 from k = 4 on, as is the
+//! sum of MATH's 1/(n − 3) over all k, but a small consensus is the one in doubt. MATH's C(k, 3) is absent: it counts
+//! each subset once for each of its triangles. Evidence is not used: on pure outliers it accepts 76–100 % (*measured*).
 
 use super::prepare::Matches;
 use super::refine::{Context, Fit};

@@ -1,9 +1,9 @@
-//! How often random matches agree by chance, measured on the problem itself: keypoints lie on walls, floors and clusters,
-//! and a uniform box would call chance agreement of dense spots significant.
+//! How often random matches agree by chance, measured on the problem itself: keypoints lie on walls, floors and
+//! clusters, and a uniform box would call chance agreement of dense spots significant.
 //!
 //! Two numbers: α(r), the chance that a random target lies within r of a given place among the targets (the correlation
-//! sum of the target points), and π₃(τ), the chance that a random triangle of matches has edges that agree within τ. Both
-//! are extrapolated to radii rarer than the samples by the slope at the smallest radius they resolve.
+//! sum of the target points), and π₃(τ), the chance that a random triangle of matches has edges that agree within τ.
+//! Both are extrapolated to radii rarer than the samples by the slope at the smallest radius they resolve.
 
 use core::f64::consts::PI;
 use libm::{exp2, log2};
@@ -38,8 +38,8 @@ pub(super) struct Chance {
 }
 
 impl Chance {
-    /// Measures the different targets, whose robust extents along their principal axes are `extent`, and random triangles
-    /// of matches; lengths are compared up to a common scale within `scale_range`.
+    /// Measures the different targets, whose robust extents along their principal axes are `extent`, and random
+    /// triangles of matches; lengths are compared up to a common scale within `scale_range`.
     pub fn measure(
         source: &[Vector3<f64>],
         target: &[Vector3<f64>],
@@ -127,8 +127,8 @@ impl Tail {
 }
 
 /// The maximum-likelihood dimension of the events within √2 times the resolved radius: their number over their sum of
-/// ln (√2 resolved radius / radius). It uses each of them, so its spread is half that of a ratio of two counts; over a wider
-/// range the ends of the scene would flatten it.
+/// ln (√2 resolved radius / radius). It uses each of them, so its spread is half that of a ratio of two counts; over a
+/// wider range the ends of the scene would flatten it.
 fn dimension(cumulative: &[u32], resolved: usize) -> f64 {
     let top = (resolved + BINS_PER_OCTAVE).min(BINS - 1);
     let (mut sum, mut last) = (0.0, 0);
@@ -141,8 +141,8 @@ fn dimension(cumulative: &[u32], resolved: usize) -> f64 {
     if sum > 0.0 { (f64::from(last) * bins / (sum * core::f64::consts::LN_2)).clamp(1.0, 3.0) } else { 3.0 }
 }
 
-/// The bin of a squared radius over the unit's square. The exponent and topmost mantissa bits of an f32 are a bin number,
-/// logarithmic within each octave up to 6 %.
+/// The bin of a squared radius over the unit's square. The exponent and topmost mantissa bits of an f32 are a bin
+/// number, logarithmic within each octave up to 6 %.
 fn bin(squared: f32) -> usize {
     const SHIFT: u32 = 23 - BINS_PER_OCTAVE.trailing_zeros();
     const FIRST: u32 = (127 - OCTAVES[0] as u32) << BINS_PER_OCTAVE.trailing_zeros();
@@ -240,8 +240,9 @@ mod tests {
         Chance::measure(&target, &target, (1.0, 1.0), [1.0, 1.0, 0.0], &mut ChaCha8Rng::seed_from_u64(seed))
     }
 
-    /// The estimates over the truth for 41 seeds: without bias, and within the spread of the few events they rest on and of
-    /// a slope carried over up to four octaves. (One seed alone says nothing: it may be anywhere in that spread.)
+    /// The estimates over the truth for 41 seeds: without bias, and within the spread of the few events they rest on
+    /// and of a slope carried over up to four octaves. (One seed alone says nothing: it may be anywhere in that
+    /// spread.)
     fn assert_unbiased(label: &str, bias_max: f64, mut ratio: impl FnMut(u64) -> f64) {
         let mut ratios: Vec<f64> = (0..41).map(&mut ratio).collect();
         ratios.sort_by(f64::total_cmp);

@@ -10,11 +10,12 @@ use super::solve::Motion;
 use super::{AlignError, Alignment, Model, Problem, Refusal, SolverConfig, Standing};
 use nalgebra::Vector3;
 
-/// Prefixes of the matches searched: rigid, with scale. The costlier the search, the finer the steps; the largest bounds
-/// time and memory, which grow with its square and worse.
+/// Prefixes of the matches searched: rigid, with scale. The costlier the search, the finer the steps; the largest
+/// bounds time and memory, which grow with its square and worse.
 const PREFIXES: [&[usize]; 2] = [&[128, 512, 2048, 8192], &[128, 256, 1024, 2048]];
-/// σ levels, σ_max over 2^level, each with its relative cost, or doubt that it is the right one: σ_max is commonly 3–10 ×
-/// the truth, and the tighter graph is the cheaper. With scale one level serves for noise from a half to three times its own.
+/// σ levels, σ_max over 2^level, each with its relative cost, or doubt that it is the right one: σ_max is commonly 3–10
+/// × the truth, and the tighter graph is the cheaper. With scale one level serves for noise from a half to three times
+/// its own.
 const LEVELS: [&[(u32, usize)]; 2] = [&[(0, 16), (1, 5), (2, 4), (3, 6), (4, 10)], &[(1, 24), (2, 4), (4, 16)]];
 /// Candidates evaluated on all matches, per step.
 const EVALUATED: usize = 3;
@@ -141,8 +142,8 @@ impl<'a> Search<'a> {
         self.conclude(best)
     }
 
-    /// How far from one another two motions put the middle of the sources, which are counted from there, in units of their
-    /// root mean square distance from it.
+    /// How far from one another two motions put the middle of the sources, which are counted from there, in units of
+    /// their root mean square distance from it.
     fn apart(&self, a: &Motion, b: &Motion) -> f64 {
         let source = &self.context.matches.source;
         let mean = source.iter().map(Vector3::norm_squared).sum::<f64>() / source.len().max(1) as f64;
@@ -166,8 +167,8 @@ impl<'a> Search<'a> {
         best
     }
 
-    /// One prefix at one σ level, for scales within `scales`: the best fit with log₁₀ NFA up to `bar`. Matches in `taken` do
-    /// not count.
+    /// One prefix at one σ level, for scales within `scales`: the best fit with log₁₀ NFA up to `bar`. Matches in
+    /// `taken` do not count.
     fn step(
         &mut self,
         pool: &[u32],

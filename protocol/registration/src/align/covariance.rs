@@ -1,12 +1,12 @@
 //! What an alignment is worth: the covariance of its local perturbation and the geometry's eigenvalues.
 //!
-//! A local perturbation moves `s R p + t` by `J δ`, J = s R [I, −p^, p] (the last column for SIM(3) only). At the inliers'
-//! centroid the information Σ w JᵀJ / σ̂² falls apart into translation, rotation and scale; the result is carried to the
-//! source origin by Ad. w = p + r p′(r) / 3 is the mean slope of the estimator's influence p r at a match, for the Gaussian
-//! mixture p (1 − (1 − p) r² / 3σ²): matches of doubtful membership inform less. How widely the influences really scatter,
-//! Σ p² r², scales the covariance (A⁻¹ B A⁻¹ of robust statistics): under Gaussian noise it adds nothing, under heavy
-//! tails it is what keeps the covariance honest. The covariance is inflated so that its χ² ellipsoid covers 95 % although σ̂ is
-//! estimated from ν = 3 Σp − dof residuals.
+//! A local perturbation moves `s R p + t` by `J δ`, J = s R [I, −p^, p] (the last column for SIM(3) only). At the
+//! inliers' centroid the information Σ w JᵀJ / σ̂² falls apart into translation, rotation and scale; the result is
+//! carried to the source origin by Ad. w = p + r p′(r) / 3 is the mean slope of the estimator's influence p r at a
+//! match, for the Gaussian mixture p (1 − (1 − p) r² / 3σ²): matches of doubtful membership inform less. How widely the
+//! influences really scatter, Σ p² r², scales the covariance (A⁻¹ B A⁻¹ of robust statistics): under Gaussian noise it
+//! adds nothing, under heavy tails it is what keeps the covariance honest. The covariance is inflated so that its χ²
+//! ellipsoid covers 95 % although σ̂ is estimated from ν = 3 Σp − dof residuals.
 
 use super::Weighting;
 use super::noise;
@@ -73,7 +73,8 @@ pub(super) fn estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
     Some(Estimate { relative, eigenvalues, rotation_sigma: (inflation / weakest).sqrt() })
 }
 
-/// The estimate where residuals have covariances of their own: the information is Σ w Jᵀ C⁻¹ J / σ̂², and does not fall apart.
+/// The estimate where residuals have covariances of their own: the information is Σ w Jᵀ C⁻¹ J / σ̂², and does not fall
+/// apart.
 fn shaped_estimate(context: &Context, fit: &Fit) -> Option<Estimate> {
     let shapes = fit.shapes.as_ref()?;
     let (weights, total, honest) = honest_weights(context, fit);
@@ -207,8 +208,8 @@ fn representable<const N: usize>(m: SMatrix<f64, N, N>) -> Option<Covariance<N>>
     Covariance::new(m).or_else(|_| Covariance::new(widened())).ok()
 }
 
-/// How much wider the 95 % ellipsoid is when σ̂² has ν degrees of freedom: d F₀.₉₅(d, ν) / χ²₀.₉₅(d), which is
-/// 1 + 4.3/(ν − 2) for d = 6 and 1 + 4.5/(ν − 2) for d = 7 within 2 % from ν = 6 on. MATH's ν/(ν − 2) fits the mean of d²
+/// How much wider the 95 % ellipsoid is when σ̂² has ν degrees of freedom: d F₀.₉₅(d, ν) / χ²₀.₉₅(d), which is 1 +
+/// 4.3/(ν − 2) for d = 6 and 1 + 4.5/(ν − 2) for d = 7 within 2 % from ν = 6 on. MATH's ν/(ν − 2) fits the mean of d²
 /// instead and covers less.
 fn inflation(freedom: f64, with_scale: bool) -> f64 {
     let excess = if with_scale { 4.5 } else { 4.3 };

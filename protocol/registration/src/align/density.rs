@@ -1,8 +1,8 @@
-//! Sums of a kernel over many residuals, each in the time of a few: a binary tree whose cells stand for their residuals by
-//! interpolation in Chebyshev nodes wherever they are seen from afar.
+//! Sums of a kernel over many residuals, each in the time of a few: a binary tree whose cells stand for their residuals
+//! by interpolation in Chebyshev nodes wherever they are seen from afar.
 //!
-//! The kernel of S(30) is smooth but for its logarithmic peak, so a cell at more than twice its half-width is replaced by
-//! [`NODES`] weighted points within 1e-7 of the sum (tested at 1e-6); a query visits O(log n) cells.
+//! The kernel of S(30) is smooth but for its logarithmic peak, so a cell at more than twice its half-width is replaced
+//! by [`NODES`] weighted points within 1e-7 of the sum (tested at 1e-6); a query visits O(log n) cells.
 
 use core::f64::consts::PI;
 
@@ -78,7 +78,8 @@ impl Tree {
         }
     }
 
-    /// A leaf, with the weights of its nodes: Σ of the Lagrange polynomials at its residuals, by the barycentric formula.
+    /// A leaf, with the weights of its nodes: Σ of the Lagrange polynomials at its residuals, by the barycentric
+    /// formula.
     fn cell(&self, centre: f64, half: f64, first: usize, last: usize) -> Cell {
         let mut weights = [0.0; NODES];
         for s in &self.sorted[first..last] {

@@ -1,5 +1,5 @@
-//! The matches of one search step in single precision, by axis, so that plain loops over 64 of them vectorise; which pairs
-//! of them agree in length, as bitsets; and how well a motion explains them.
+//! The matches of one search step in single precision, by axis, so that plain loops over 64 of them vectorise; which
+//! pairs of them agree in length, as bitsets; and how well a motion explains them.
 
 use super::prepare::Matches;
 use super::refine::Context;

@@ -2,17 +2,19 @@
 //! similarity with a calibrated covariance, or to a refusal that says why.
 //!
 //! The noise scale σ is not told, only bounded by `sigma_max`; it is marginalised in each step (MATH §4):
-//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree (`graph`; for SIM(3) from matches that agree
-//!    about a pair, at one scale, `scales`, and on one turn, `turns`), ranked by how many further matches agree with them, on nested prefixes of the matches (best scores first)
-//!    and σ levels from tight to loose; `tally` prescores each by its own number of false alarms over all radii.
+//! 1. `sample` proposes hypotheses from triangles of matches whose lengths agree (`graph`; for SIM(3) from matches that
+//!    agree about a pair, at one scale, `scales`, and on one turn, `turns`), ranked by how many further matches agree
+//!    with them, on nested prefixes of the matches (best scores first) and σ levels from tight to loose; `tally`
+//!    prescores each by its own number of false alarms over all radii.
 //! 2. `evidence` starts the refinement at the σ of highest evidence, of a Gaussian-inlier, uniform-outlier mixture.
 //! 3. `refine` polishes by expectation-maximisation, then by the kernel density weights S(12)–S(30) of [`sigma`] where
 //!    they predict held-out residuals better.
-//! 4. `accept` admits by number of false alarms (`chance` measures what chance does), never by evidence; a disjoint rival
-//!    makes the answer ambiguous.
+//! 4. `accept` admits by number of false alarms (`chance` measures what chance does), never by evidence; a disjoint
+//!    rival makes the answer ambiguous.
 //! 5. `covariance` states what is known, and refuses geometry that leaves a direction undetermined.
 //!
-//! Points may have covariances of their own (`noise`): search and prescore go by a typical one, all later steps by each.
+//! Points may have covariances of their own (`noise`): search and prescore go by a typical one, all later steps by
+//! each.
 //!
 //! Everything is a function of the *set* of matches and the seed: matches are sorted first, so their order changes
 //! nothing, to the bit.
@@ -59,8 +61,8 @@ pub struct Problem<'a> {
     pub target: &'a [[f64; 3]],
     /// How trustworthy each match is, higher is better; only their order matters. Good matches are tried first.
     pub scores: Option<&'a [f64]>,
-    /// Covariance of each source point, in the source frame. Of the sides, one that states none counts as exact; if neither
-    /// does, all matches count as alike.
+    /// Covariance of each source point, in the source frame. Of the sides, one that states none counts as exact; if
+    /// neither does, all matches count as alike.
     pub source_covariances: Option<&'a [Covariance<3>]>,
     /// Covariance of each target point, in the target frame.
     pub target_covariances: Option<&'a [Covariance<3>]>,

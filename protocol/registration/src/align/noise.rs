@@ -1,9 +1,10 @@
 //! Per-point covariances: how far each match may lie apart, and in which direction.
 //!
-//! The residual of a true match has covariance `σ² C`, `C = C_target + s² R C_source Rᵀ`. The covariances are known up to
-//! the common factor σ², which is marginalised as ever: they are divided by the median over the matches of a third of the
-//! trace of `C` at scale 1, so that σ̂ stays the standard deviation per axis of a typical match, in metres. Search and
-//! prescore take each match by that typical σ alone; evidence, posteriors, refinement, acceptance and covariance take `C`.
+//! The residual of a true match has covariance `σ² C`, `C = C_target + s² R C_source Rᵀ`. The covariances are known up
+//! to the common factor σ², which is marginalised as ever: they are divided by the median over the matches of a third
+//! of the trace of `C` at scale 1, so that σ̂ stays the standard deviation per axis of a typical match, in metres.
+//! Search and prescore take each match by that typical σ alone; evidence, posteriors, refinement, acceptance and
+//! covariance take `C`.
 
 use super::Problem;
 use super::prepare::median_of;
@@ -11,7 +12,8 @@ use super::solve::Motion;
 use crate::geometry::{Covariance, So3};
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
-/// Largest over smallest variance that a problem's points may have, in any directions: four digits of standard deviation.
+/// Largest over smallest variance that a problem's points may have, in any directions: four digits of standard
+/// deviation.
 pub const CONDITION_MAX: f64 = 1e8;
 /// Steps of Gauss and Newton per refit: the next refit goes on from there.
 const STEPS: usize = 2;

@@ -1,11 +1,12 @@
 //! Hypotheses from triangles of matches whose edge lengths agree.
 //!
 //! A rigid motion keeps lengths, so true matches are mutually compatible: they form a dense part of the compatibility
-//! graph, kept as bitsets. Edges whose ends have no more common neighbours than chance gives are dropped, and the common
-//! neighbours of the rest counted again among the rest: even ten true among a thousand matches then stand alone. For SIM(3)
-//! there is a graph per narrow bin of scale ([`super::scales`]), too dense for that; there whole bundles of matches that
-//! agree about a pair take the place of triangles ([`super::turns`]). Each motion is worth its own number of false alarms
-//! ([`super::tally`]), is improved by reweighted solves, and spares the triangles it explains: candidates are distinct.
+//! graph, kept as bitsets. Edges whose ends have no more common neighbours than chance gives are dropped, and the
+//! common neighbours of the rest counted again among the rest: even ten true among a thousand matches then stand alone.
+//! For SIM(3) there is a graph per narrow bin of scale ([`super::scales`]), too dense for that; there whole bundles of
+//! matches that agree about a pair take the place of triangles ([`super::turns`]). Each motion is worth its own number
+//! of false alarms ([`super::tally`]), is improved by reweighted solves, and spares the triangles it explains:
+//! candidates are distinct.
 
 use super::graph::{Cloud, Graph, common, positions};
 use super::refine::Context;
@@ -20,11 +21,11 @@ use pulp::Arch;
 
 /// Edges whose common neighbours are counted, at most, in one graph; beyond, an even selection.
 const EDGES_MAX: usize = 262_144;
-/// An edge is kept if its ends have this many standard deviations more common neighbours than their degrees explain, or if
-/// they share most: where nearly all matches are true, degrees explain everything.
+/// An edge is kept if its ends have this many standard deviations more common neighbours than their degrees explain, or
+/// if they share most: where nearly all matches are true, degrees explain everything.
 const EXCESS_MIN: f32 = 1.0;
-/// Edges expanded to triangles, at most and at least. Where the ends of the best share more than [`DENSE`] of all matches,
-/// nearly all good edges are of one structure, and fewer serve.
+/// Edges expanded to triangles, at most and at least. Where the ends of the best share more than [`DENSE`] of all
+/// matches, nearly all good edges are of one structure, and fewer serve.
 const EDGES_EXPANDED: [usize; 2] = [256, 24];
 /// See [`EDGES_EXPANDED`].
 const DENSE: f64 = 0.06;
@@ -426,8 +427,8 @@ impl Sampler {
         (fits && (low..=high).contains(&motion.scale)).then_some(motion)
     }
 
-    /// Reweighted solves over the pool while the worth grows, at the first of these multiples of the consensus' radius at
-    /// which it does.
+    /// Reweighted solves over the pool while the worth grows, at the first of these multiples of the consensus' radius
+    /// at which it does.
     fn improve(&mut self, context: &Context, start: Candidate, multiples: &[f64]) -> Candidate {
         let mut best = start;
         for _ in 0..IMPROVEMENTS {
@@ -475,8 +476,9 @@ fn kept_by(out: &[Candidate], candidate: &Candidate, margin: f64) -> bool {
     out.len() < CANDIDATES_MAX || out.iter().any(|c| c.worth.score < candidate.worth.score + margin)
 }
 
-/// How unlikely so many common neighbours are where `expected` are: of two Poisson counts 1000 times the squared difference
-/// after the square root has made their variances equal (a quarter), which is near enough −1000 ln of the tail.
+/// How unlikely so many common neighbours are where `expected` are: of two Poisson counts 1000 times the squared
+/// difference after the square root has made their variances equal (a quarter), which is near enough −1000 ln of the
+/// tail.
 fn surprise(common: u32, expected: f64) -> u32 {
     let excess = f64::from(common).sqrt() - expected.max(0.05).sqrt();
     if excess > 0.0 { (4000.0 * excess * excess) as u32 } else { 0 }

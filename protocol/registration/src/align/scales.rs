@@ -85,8 +85,8 @@ impl Scales {
         self.bins
     }
 
-    /// Notes the bins of all pairs. Bins are equally wide in √s: between equal ratios and equal differences, which would
-    /// suit noise in the source and in the target.
+    /// Notes the bins of all pairs. Bins are equally wide in √s: between equal ratios and equal differences, which
+    /// would suit noise in the source and in the target.
     pub fn measure(&mut self, arch: Arch, cloud: &Cloud, vote: &Vote) {
         let to_cloud = cloud.source_unit / cloud.unit;
         let (low, high) = (vote.range.0 * to_cloud, vote.range.1 * to_cloud);

@@ -22,9 +22,9 @@ const SQRT_2PI: f64 = 2.506_628_274_631_000_2;
 
 /// The exponential integral `E₁(x) = ∫_x^∞ e^{−t}/t dt`, relative error below 1e-14.
 ///
-/// The power series up to 1, the continued fraction by Lentz's method beyond (Abramowitz and Stegun 5.1.11, 5.1.22). Own
-/// code because results must be equal to the bit on all machines, and the crates at hand use the platform's `exp`, `ln`.
-/// Infinite at 0, NaN below.
+/// The power series up to 1, the continued fraction by Lentz's method beyond (Abramowitz and Stegun 5.1.11, 5.1.22).
+/// Own code because results must be equal to the bit on all machines, and the crates at hand use the platform's `exp`,
+/// `ln`. Infinite at 0, NaN below.
 pub fn e1(x: f64) -> f64 {
     if x.is_nan() || x < 0.0 {
         f64::NAN
@@ -158,8 +158,9 @@ impl NormDensity {
     }
 }
 
-/// [`NormDensity::at_sample`] of every sample, with samples counted in bins of a quarter of the bandwidth: O(n) for all, and
-/// near enough to ask which of two densities predicts better (a sum of many logarithms: *measured* within 1 % a sample).
+/// [`NormDensity::at_sample`] of every sample, with samples counted in bins of a quarter of the bandwidth: O(n) for
+/// all, and near enough to ask which of two densities predicts better (a sum of many logarithms: *measured* within 1 %
+/// a sample).
 #[derive(Clone, Debug, Default)]
 pub(super) struct BinnedDensity {
     counts: Vec<f64>,

@@ -1,7 +1,8 @@
 //! The prescore of a hypothesis: its own number of false alarms, from a histogram of squared residuals.
 //!
-//! The smallest NFA over all radii is marginal in σ and is what acceptance asks in the end ([`super::accept`]), so a search
-//! at any σ level ranks hypotheses alike. With the chance of agreement tabled per radius it costs a few additions a bin.
+//! The smallest NFA over all radii is marginal in σ and is what acceptance asks in the end ([`super::accept`]), so a
+//! search at any σ level ranks hypotheses alike. With the chance of agreement tabled per radius it costs a few
+//! additions a bin.
 
 use super::accept;
 use super::evidence::SIGMA_SPAN;

@@ -1,9 +1,10 @@
 //! Hypotheses for a similarity: two matches, and the turn about the line through them on which others agree.
 //!
-//! Two matches fix a similarity up to that turn. A third one whose distances to both agree in scale fixes it, and true ones
-//! fix the same turn, whereas chance ones fix any: a histogram of turns therefore tells a true pair from a chance one long
-//! before any motion is solved for. It replaces the search for triangles where a graph of equal scales is too dense to show
-//! cliques: a pair of lengths tells a scale only as well as a single coordinate, a match near a triangle all three.
+//! Two matches fix a similarity up to that turn. A third one whose distances to both agree in scale fixes it, and true
+//! ones fix the same turn, whereas chance ones fix any: a histogram of turns therefore tells a true pair from a chance
+//! one long before any motion is solved for. It replaces the search for triangles where a graph of equal scales is too
+//! dense to show cliques: a pair of lengths tells a scale only as well as a single coordinate, a match near a triangle
+//! all three.
 
 use super::graph::{Cloud, Graph, common, positions};
 use core::cmp::Reverse;
@@ -90,7 +91,8 @@ impl Turns {
         (PAIRS / bins.max(1)).max(PAIRS_MIN)
     }
 
-    /// Adds the bundles about the most promising `quota` of the pairs in `seeds`, whose neighbours are those of `graph`.
+    /// Adds the bundles about the most promising `quota` of the pairs in `seeds`, whose neighbours are those of
+    /// `graph`.
     #[inline(always)]
     pub fn find(&mut self, cloud: &Cloud, noise: Noise, graph: &Graph, seeds: &Graph, quota: usize) {
         self.rank_pairs(graph, seeds, quota);
@@ -265,8 +267,8 @@ fn dot(a: &[f32; 3], b: &[f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// How unlikely so many are where `expected` are: of Poisson counts four times the squared difference after the square root
-/// has made their variances equal, which is near enough −2 ln of the tail.
+/// How unlikely so many are where `expected` are: of Poisson counts four times the squared difference after the square
+/// root has made their variances equal, which is near enough −2 ln of the tail.
 fn surprise(count: f32, expected: f32) -> f32 {
     let excess = count.sqrt() - expected.max(0.05).sqrt();
     if excess > 0.0 { 4.0 * excess * excess } else { 0.0 }

@@ -1,18 +1,18 @@
-//! Whether a place looks like another: a pose is right only if its rivals are wrong, and these must be looked for. Among
-//! shelves or rooms that are all the same, the matches that agree with the best pose leave none for the next shelf: each
-//! keypoint's nearest features are where the robots stood alike. So once a pose would be accepted, each keypoint is matched
-//! again with those of its nearest features that lie *elsewhere*, and the poses that these matches suggest, with those that
-//! the surfaces do (`shifts`), are polished and looked at like the first ones; what slides back to the best pose takes no
-//! other's place. Chance was learned before: a rival need not score.
+//! Whether a place looks like another: a pose is right only if its rivals are wrong, and these must be looked for.
+//! Among shelves or rooms that are all the same, the matches that agree with the best pose leave none for the next
+//! shelf: each keypoint's nearest features are where the robots stood alike. So once a pose would be accepted, each
+//! keypoint is matched again with those of its nearest features that lie *elsewhere*, and the poses that these matches
+//! suggest, with those that the surfaces do (`shifts`), are polished and looked at like the first ones; what slides
+//! back to the best pose takes no other's place. Chance was learned before: a rival need not score.
 //!
-//! A rival covers less of my submap than the best pose, since robots see best what is near, and so scores less: that says
-//! nothing. It stands unless my views contradict it, if enough of their points and matches agree with it, and what they
-//! agree with faces all ways: on a floor or along one wall anything can be slid.
+//! A rival covers less of my submap than the best pose, since robots see best what is near, and so scores less: that
+//! says nothing. It stands unless my views contradict it, if enough of their points and matches agree with it, and what
+//! they agree with faces all ways: on a floor or along one wall anything can be slid.
 //!
-//! *Measured* (pairs that were accepted, and how many of them have a rival that stands, when all features were searched and a
-//! thousand poses tried). Ray-cast worlds seen for 12 m:
-//! shelves without end every 5 m 77 of 77, every 8 m 75 of 79; rooms of 8 m, of which one hardly sees the next, 62 of 76.
-//! True pairs: halls 0 of 59, 7-Scenes 0 of 84, KITTI 07 0 of 19.
+//! *Measured* (pairs that were accepted, and how many of them have a rival that stands, when all features were searched
+//! and a thousand poses tried). Ray-cast worlds seen for 12 m: shelves without end every 5 m 77 of 77, every 8 m 75 of
+//! 79; rooms of 8 m, of which one hardly sees the next, 62 of 76. True pairs: halls 0 of 59, 7-Scenes 0 of 84, KITTI 07
+//! 0 of 19.
 
 use super::features::Features;
 use super::gravity::Upright;

@@ -1,8 +1,9 @@
 //! Cuts a stream of keyframes into submaps. A submap ends with the keyframe that took the body `distance_m` or
-//! `rotation_deg` away from its first body pose, that is its `keyframes_max`-th, or that came `secs_max` after the first
-//! while the body did not merely stand; the next keyframe begins the next one. It ends before a motion that would let its
-//! last pose be uncertain by more than `sigma_max_m` or `sigma_max_deg`: so a hole in the odometry lies between submaps,
-//! where the joint estimate can mend it, and bends none. The odometry between consecutive anchors compounds every motion in between, so that they chain without gaps.
+//! `rotation_deg` away from its first body pose, that is its `keyframes_max`-th, or that came `secs_max` after the
+//! first while the body did not merely stand; the next keyframe begins the next one. It ends before a motion that would
+//! let its last pose be uncertain by more than `sigma_max_m` or `sigma_max_deg`: so a hole in the odometry lies between
+//! submaps, where the joint estimate can mend it, and bends none. The odometry between consecutive anchors compounds
+//! every motion in between, so that they chain without gaps.
 //!
 //! A submap is anchored at its *middle* keyframe. Odometry that drifts bends the cloud, and what others align with is
 //! the cloud as a whole. For a random walk of variance w per submap the cloud's mean lies w/3 from the first body pose,
@@ -126,8 +127,8 @@ impl SubmapBuilder {
         }
     }
 
-    /// A builder at the start of a new frame, which knows what runs of the front end are over: with `is_over` that of this
-    /// frame, too.
+    /// A builder at the start of a new frame, which knows what runs of the front end are over: with `is_over` that of
+    /// this frame, too.
     #[must_use]
     pub fn begun_anew(&self, is_over: bool) -> Self {
         Self { runs: self.runs.begun_anew(is_over), ..Self::new(self.config.clone()) }
@@ -195,14 +196,14 @@ impl SubmapBuilder {
         Some((index, self.since_finished?, self.last.as_ref()?.stamp))
     }
 
-    /// How far, in voxels, the views of submaps are from fitting together where the SLAM put them: said once, when it is
-    /// so much that the intrinsics, the unit, the extrinsics or the odometry must be wrong. Only of depth cameras.
+    /// How far, in voxels, the views of submaps are from fitting together where the SLAM put them: said once, when it
+    /// is so much that the intrinsics, the unit, the extrinsics or the odometry must be wrong. Only of depth cameras.
     pub fn take_misfit(&mut self) -> Option<f64> {
         self.misfit.take()
     }
 
-    /// Passes over a keyframe that there is no room for. Where it is counts, so that what goes on from it later is known to
-    /// go on; the odometry has a hole.
+    /// Passes over a keyframe that there is no room for. Where it is counts, so that what goes on from it later is
+    /// known to go on; the odometry has a hole.
     pub fn pass(&mut self, keyframe: &Keyframe) {
         if self.check(keyframe).is_ok() {
             self.continuity.take(keyframe, &self.config);

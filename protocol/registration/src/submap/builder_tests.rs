@@ -34,8 +34,8 @@ fn a_submap_ends_at_each_limit_and_not_before() {
     assert_eq!(drive(&mut SubmapBuilder::new(single), &along(0.0)[..3]).0, vec![0, 1, 2]);
 }
 
-/// Keyframes at these times (s) and places, with this standard deviation of each motion: which closed a submap, and how many
-/// keyframes it has.
+/// Keyframes at these times (s) and places, with this standard deviation of each motion: which closed a submap, and how
+/// many keyframes it has.
 fn timed(config: SubmapConfig, keyframes: &[(f64, Se3)], sigma: f64) -> Vec<(usize, usize)> {
     let mut builder = SubmapBuilder::new(config);
     let push = |(k, (secs, pose)): (usize, &(f64, Se3))| {

@@ -1,38 +1,40 @@
-//! Whether a keyframe goes on from the one before it. A SLAM that restarts, or relocalises, puts the body elsewhere from one
-//! keyframe to the next; taken for odometry, that would be a motion of many metres with a stated σ of centimetres, and the
-//! map would be bent by it for good.
+//! Whether a keyframe goes on from the one before it. A SLAM that restarts, or relocalises, puts the body elsewhere
+//! from one keyframe to the next; taken for odometry, that would be a motion of many metres with a stated σ of
+//! centimetres, and the map would be bent by it for good.
 //!
-//! A step is judged three ways. One that stays within a submap's own bounds (`distance_m`, `rotation_deg`) always goes on.
-//! A longer one must be *possible*: not beyond `speed_max_m_s` (where the unit is the metre), `turn_max_deg_s` and
+//! A step is judged three ways. One that stays within a submap's own bounds (`distance_m`, `rotation_deg`) always goes
+//! on. A longer one must be *possible*: not beyond `speed_max_m_s` (where the unit is the metre), `turn_max_deg_s` and
 //! [`JUMP_SUBMAPS_MAX`]. And, once it is known how this front end hands over keyframes, it must be *usual*: not beyond
-//! [`STEPS_MAX`] of its longest steps, nor beyond twice its speed for up to [`LOST_SECS_MAX`]. The last is relative, so that
-//! it holds in any unit, for a car as for a crawler. Each is widened by four of the stated standard deviations: whoever
-//! says that he does not know the motion is believed.
+//! [`STEPS_MAX`] of its longest steps, nor beyond twice its speed for up to [`LOST_SECS_MAX`]. The last is relative, so
+//! that it holds in any unit, for a car as for a crawler. Each is widened by four of the stated standard deviations:
+//! whoever says that he does not know the motion is believed.
 //!
 //! What time has passed counts only so far, since a SLAM that restarts takes seconds: what the body may have driven
-//! meanwhile nobody measured. Only after [`SILENT_SECS_MIN`] may a step span [`SILENT_SUBMAPS_MAX`] submaps in any case.
+//! meanwhile nobody measured. Only after [`SILENT_SECS_MIN`] may a step span [`SILENT_SUBMAPS_MAX`] submaps in any
+//! case.
 //!
-//! A keyframe that does not go on is refused, and remembered. If the next ones go on from *it*, the frame is another one.
-//! Between the old way and the new one the nearer counts, so that the robot's new way, which may lead past the old one, is
-//! not taken back into it.
+//! A keyframe that does not go on is refused, and remembered. If the next ones go on from *it*, the frame is another
+//! one. Between the old way and the new one the nearer counts, so that the robot's new way, which may lead past the old
+//! one, is not taken back into it.
 
 use super::odometry::motion;
 use super::{Keyframe, KeyframeError};
 use crate::config::SubmapConfig;
 use crate::kinds::ScaleKind;
 
-/// Lengths of a submap (`distance_m`) that a body may move between two keyframes at most, however fast it is: a submap is
-/// cut from several.
+/// Lengths of a submap (`distance_m`) that a body may move between two keyframes at most, however fast it is: a submap
+/// is cut from several.
 pub const JUMP_SUBMAPS_MAX: f64 = 10.0;
 /// Longest steps of a front end that one step may span: three keyframes in a row may be lost.
 pub const STEPS_MAX: f64 = 4.0;
 /// How long keyframes may be lost at twice the usual speed, s, if they come faster than that.
 pub const LOST_SECS_MAX: f64 = 2.0;
-/// After so long without a keyframe, s, a step may be longer: a front end that takes keyframes of what it sees takes none
-/// where it sees nothing.
+/// After so long without a keyframe, s, a step may be longer: a front end that takes keyframes of what it sees takes
+/// none where it sees nothing.
 pub const SILENT_SECS_MIN: f64 = 10.0;
-/// Lengths of a submap (`distance_m`) that such a step may span: the silence leaves no more than a submap or two unseen.
-/// *Measured*: of the MRCLAM robots' 23 minutes the longest step is 3.94 m, after 58 s without a landmark 2.98 m.
+/// Lengths of a submap (`distance_m`) that such a step may span: the silence leaves no more than a submap or two
+/// unseen. *Measured*: of the MRCLAM robots' 23 minutes the longest step is 3.94 m, after 58 s without a landmark 2.98
+/// m.
 pub const SILENT_SUBMAPS_MAX: f64 = 2.0;
 /// Keyframes from another place, each going on from the one before as is usual, that are another frame.
 pub const RESTART_KEYFRAMES: u32 = 4;

@@ -244,8 +244,8 @@ fn sessions_that_are_over_stay_so_and_a_bad_keyframe_begins_none() {
     assert!(builder.begun_anew(false).push(of(0)).is_ok());
 }
 
-/// Poses that a loop closure corrected: a correction within a submap's length passes, with a covariance that knows nothing
-/// of it; so says the documentation.
+/// Poses that a loop closure corrected: a correction within a submap's length passes, with a covariance that knows
+/// nothing of it; so says the documentation.
 #[test]
 fn absolute_poses_may_be_corrected_a_little() {
     let of_pose = |secs: f64, x: f64, sigma: f64| {

@@ -82,9 +82,10 @@ fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {
     Described { keypoints: keypoints.before(further.as_ref()), features, further, summary, extent }
 }
 
-/// Keypoints among the `shaped` points, up to so many at first and so many further ones, and the descriptors of all that were
-/// considered for the first, which cover the submap evenly. Descriptors are drawn from the block, as those of the features
-/// are. The further ones, seldom asked for, cover what was not considered evenly, and change nothing of the first.
+/// Keypoints among the `shaped` points, up to so many at first and so many further ones, and the descriptors of all
+/// that were considered for the first, which cover the submap evenly. Descriptors are drawn from the block, as those of
+/// the features are. The further ones, seldom asked for, cover what was not considered evenly, and change nothing of
+/// the first.
 fn keypoints(block: &Block<0>, shaped: &[u32], counts: [usize; 2]) -> (Keypoints, Keypoints, Vec<Code>) {
     let (points, normals) = in_voxels(block);
     let [first, further] = counts.map(|count| count.min(KEYPOINTS_MAX));

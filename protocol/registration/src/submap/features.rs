@@ -2,8 +2,8 @@
 //! [`Features`] are all of them, kept privately by the owner. Both share one bounded layout; keypoints are the prefix
 //! of a priority order, so fewer are cut from more by keeping the first.
 //!
-//! A blob may be gone on with: it then ends with the address of another one that holds further keypoints, so that whoever
-//! trusts the first can trust the second. The spare byte of the header (position 5) tells so.
+//! A blob may be gone on with: it then ends with the address of another one that holds further keypoints, so that
+//! whoever trusts the first can trust the second. The spare byte of the header (position 5) tells so.
 //!
 //! Describing *all* points takes several times as long as everything else about a submap, and most submaps are never
 //! compared with a peer's. So keypoints carry their descriptors, and features come by theirs when first asked.
@@ -97,8 +97,8 @@ impl Keypoints {
         self.further
     }
 
-    /// These and further ones; `None` if those cannot be of the same submap. (That they are is their owner's word, who signed
-    /// the address of the blob that names theirs.)
+    /// These and further ones; `None` if those cannot be of the same submap. (That they are is their owner's word, who
+    /// signed the address of the blob that names theirs.)
     pub fn with_further(&self, further: &Self) -> Option<Self> {
         let landmarks = match (&self.landmarks, &further.landmarks) {
             (None, None) => None,

@@ -6,9 +6,9 @@
 //! variance σ² = σ_theirs² + σ_mine² + σ_pose² along each axis, so angle² / σ² has a χ² distribution of two degrees of
 //! freedom; what exceeds its 99.9 % quantile is refused.
 //!
-//! **Mean.** Errors of one sensor's verticals have much in common (the bias of its accelerometer, how it is mounted), so
-//! that averaging those of a submap's keyframes makes them no surer: the mean is as uncertain as if they all erred alike, or
-//! as they scatter, whichever is more.
+//! **Mean.** Errors of one sensor's verticals have much in common (the bias of its accelerometer, how it is mounted),
+//! so that averaging those of a submap's keyframes makes them no surer: the mean is as uncertain as if they all erred
+//! alike, or as they scatter, whichever is more.
 
 use super::block::{folded, unfolded};
 use super::scene::Pose;
@@ -49,8 +49,8 @@ pub enum UpError {
 }
 
 impl Up {
-    /// A direction of length 1 to within [`UP_LENGTH_TOLERANCE`], and its standard deviation about each horizontal axis,
-    /// rad, within [`UP_SIGMA_RANGE_RAD`].
+    /// A direction of length 1 to within [`UP_LENGTH_TOLERANCE`], and its standard deviation about each horizontal
+    /// axis, rad, within [`UP_SIGMA_RANGE_RAD`].
     ///
     /// # Errors
     /// [`UpError`].
@@ -125,8 +125,8 @@ fn level(sigma: f64) -> u8 {
     (0..u8::MAX).find(|&level| sigma_of(level) >= sigma).unwrap_or(u8::MAX)
 }
 
-/// The mean of what keyframes at `t_anchor_body` know, in the anchor frame. `motions` lead from each keyframe to the next:
-/// what the turn since the `anchor`-th one is not known well counts as an error of the vertical.
+/// The mean of what keyframes at `t_anchor_body` know, in the anchor frame. `motions` lead from each keyframe to the
+/// next: what the turn since the `anchor`-th one is not known well counts as an error of the vertical.
 pub(super) fn mean(
     ups: &[Option<Up>],
     t_anchor_body: &[Se3],
@@ -164,13 +164,13 @@ fn turn_variances(motions: &[PoseWithCovariance], anchor: usize, keyframes: usiz
     (0..keyframes).map(between).collect()
 }
 
-/// Standard deviation of a pose's tilt, rad, before it is polished, beyond what the verticals err: poses of few matches are
-/// often off by several degrees,...
+/// Standard deviation of a pose's tilt, rad, before it is polished, beyond what the verticals err: poses of few matches
+/// are often off by several degrees,...
 const TILT_SIGMA_ROUGH: f64 = 0.06;
 /// ...and polished ones hardly by one.
 const TILT_SIGMA: f64 = 0.02;
-/// Who knows the vertical less well than this, rad, had better take the ground from what is seen: over a hundred voxels it
-/// would be three off.
+/// Who knows the vertical less well than this, rad, had better take the ground from what is seen: over a hundred voxels
+/// it would be three off.
 const GROUND_SIGMA_MAX: f64 = 0.03;
 
 /// Both verticals of a pair of submaps.

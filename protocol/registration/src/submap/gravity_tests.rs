@@ -114,7 +114,8 @@ proptest! {
         }
     }
 
-    /// However two submaps are turned, and whichever way three standard deviations of all that errs lead: the truth passes.
+    /// However two submaps are turned, and whichever way three standard deviations of all that errs lead: the truth
+    /// passes.
     #[test]
     fn the_true_rotation_passes(
         turns in any::<[(i8, i8, i8); 2]>(),

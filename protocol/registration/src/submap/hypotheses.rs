@@ -1,6 +1,6 @@
-//! Poses worth a look, from matches of which one in two hundred may be right. Two matches of oriented points determine a
-//! pose and over-determine it fourfold: the distance, each normal's angle with the line between, and the angle between
-//! the normals must agree. Pairs of matches that do are ranked by how many further matches agree with both
+//! Poses worth a look, from matches of which one in two hundred may be right. Two matches of oriented points determine
+//! a pose and over-determine it fourfold: the distance, each normal's angle with the line between, and the angle
+//! between the normals must agree. Pairs of matches that do are ranked by how many further matches agree with both
 //! (second-order compatibility, Chen et al. 2022), and polished on those. Lengths are in voxels.
 
 use super::matching::Pairing;
@@ -209,8 +209,8 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// A hundred and twenty matches say one pose, a hundred and five the next bay: both must be found, though the pairs of
-    /// the first alone are more than are tried.
+    /// A hundred and twenty matches say one pose, a hundred and five the next bay: both must be found, though the pairs
+    /// of the first alone are more than are tried.
     #[test]
     fn many_matches_of_one_pose_do_not_hide_another() {
         let mut dice = ChaCha8Rng::seed_from_u64(4);

@@ -105,7 +105,8 @@ pub fn describe_points(points: &[[f32; 3]], normals: &[[f32; 3]], chosen: &[u32]
     numbers
 }
 
-/// What [`sums`] needs, as something to be run with the widest instructions: it is too large to be inlined from a closure.
+/// What [`sums`] needs, as something to be run with the widest instructions: it is too large to be inlined from a
+/// closure.
 struct Around<'a, const R: usize> {
     lanes: &'a Lanes<6>,
     p: &'a [f32; 3],

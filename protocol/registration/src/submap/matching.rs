@@ -152,7 +152,8 @@ fn compare(code: &Code, codes: &[Code], distances: &mut [i32]) {
     }
 }
 
-/// Share of their keypoints that come to lie within `radius` (my frame's units) of a point of mine; 0 without keypoints.
+/// Share of their keypoints that come to lie within `radius` (my frame's units) of a point of mine; 0 without
+/// keypoints.
 pub fn fit(theirs: &Keypoints, mine: &Features, t_mine_theirs: &Sim3, radius: f64) -> f64 {
     let my_points: Vec<Vector3<f64>> = mine.surfels().iter().map(|s| s.position).collect();
     let index = Index::new(&my_points);

@@ -71,7 +71,8 @@ pub struct Keyframe {
     pub stamp: Stamp,
     /// Which run of the front end it is of, if it says: another one is another frame, hence a new epoch.
     pub session: Option<u64>,
-    /// `t_frame_body`: pose of the body in the SLAM's local frame, and a covariance whose meaning `covariance_of` tells.
+    /// `t_frame_body`: pose of the body in the SLAM's local frame, and a covariance whose meaning `covariance_of`
+    /// tells.
     pub pose: PoseWithCovariance,
     /// What the covariance describes.
     pub covariance_of: CovarianceOf,

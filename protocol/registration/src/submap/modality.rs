@@ -1,5 +1,5 @@
-//! What tells sensors apart, a row for each, without wild cards: whoever adds a sensor is asked for its row by the compiler,
-//! and nothing else of this crate asks which sensor it was.
+//! What tells sensors apart, a row for each, without wild cards: whoever adds a sensor is asked for its row by the
+//! compiler, and nothing else of this crate asks which sensor it was.
 
 use crate::config::Sensor;
 
@@ -12,8 +12,8 @@ pub struct Modality {
     pub planar: bool,
     /// Scan matching sharpens the motion between keyframes, so that submaps lie in a frame that is not the SLAM's.
     pub sharpens: bool,
-    /// All its views of a place are bent alike, as those of a depth camera of a wrong lens are: they are tried against one
-    /// another, and an alignment reckons with it.
+    /// All its views of a place are bent alike, as those of a depth camera of a wrong lens are: they are tried against
+    /// one another, and an alignment reckons with it.
     pub bends: bool,
     /// It measures ranges of its own, as a LiDAR does, whose errors are independent and small.
     pub ranges: bool,

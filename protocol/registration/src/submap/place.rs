@@ -1,10 +1,11 @@
-//! What a user's own place recognition (NetVLAD and the like) says of a keyframe: a vector that means nothing to us, and
-//! how two of them are compared. A submap's is the mean of its keyframes'; it travels in the summary, a byte a number, and
-//! where two submaps have one of the same kind it takes our own descriptor's place in proposing what to align.
+//! What a user's own place recognition (NetVLAD and the like) says of a keyframe: a vector that means nothing to us,
+//! and how two of them are compared. A submap's is the mean of its keyframes'; it travels in the summary, a byte a
+//! number, and where two submaps have one of the same kind it takes our own descriptor's place in proposing what to
+//! align.
 //!
-//! Longer vectors are folded to [`NUMBERS_MAX`] numbers by signed hashing (Weinberger et al. 2009, "Feature hashing"): a
-//! cosine c stays what it is but for (1 − c²) / 16, a distance but for 1/23 of itself (one standard deviation). Whiten and
-//! shorten them yourself if you can do better.
+//! Longer vectors are folded to [`NUMBERS_MAX`] numbers by signed hashing (Weinberger et al. 2009, "Feature hashing"):
+//! a cosine c stays what it is but for (1 − c²) / 16, a distance but for 1/23 of itself (one standard deviation).
+//! Whiten and shorten them yourself if you can do better.
 
 use super::summary::WORDS;
 use serde::{Deserialize, Serialize};
@@ -134,8 +135,8 @@ impl PlaceDescriptor {
     }
 }
 
-/// Where a number of a long vector is added, and with which sign. SplitMix64 (Steele, Lea & Flood 2014) scatters well, and
-/// is the same on every robot for all time.
+/// Where a number of a long vector is added, and with which sign. SplitMix64 (Steele, Lea & Flood 2014) scatters well,
+/// and is the same on every robot for all time.
 fn fold(index: u64) -> (usize, f64) {
     let mut z = index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -202,8 +203,8 @@ impl Place {
         Self { kind, step, numbers, square }
     }
 
-    /// How alike two places are, 0 to 1 (equal), as their metric has it: the cosine, or how far they are from one another
-    /// beside how far they can be, `1 − d / (|a| + |b|)`. `None` if they are of different kinds.
+    /// How alike two places are, 0 to 1 (equal), as their metric has it: the cosine, or how far they are from one
+    /// another beside how far they can be, `1 − d / (|a| + |b|)`. `None` if they are of different kinds.
     pub(super) fn similarity(&self, other: &Self) -> Option<f64> {
         if self.kind != other.kind {
             return None;

@@ -2,13 +2,13 @@
 //! of the peer's keypoints against one's own thinned cloud, with Cauchy weights at an estimated noise scale.
 //!
 //! **Honest covariance.** The textbook σ²H⁻¹ takes residuals as independent; those of two thinned, partial views of one
-//! surface are not. On 77 real pairs with known poses its NEES is 185 instead of 6: depth images and the poses inside
-//! a submap bend whole submaps, errors that neither shrink with the number of keypoints nor show in the residuals
-//! (sandwich and jackknife estimators over patches of 4 to 40 voxels were no better, NEES 170 to 14,000). Measured,
-//! the error is nevertheless shaped like H⁻¹: large where the geometry is weak. So the textbook form stays, but
-//! however many keypoints there are they count as at most [`INDEPENDENT_MAX`] measurements, and as fewer with the square
-//! of the overlap. A LiDAR does not bend what it sees: what its points have in common is the surface's shape between
-//! them and the odometry of the submap, and they count as [`INDEPENDENT_LIDAR_MAX`], and as fewer with the overlap.
+//! surface are not. On 77 real pairs with known poses its NEES is 185 instead of 6: depth images and the poses inside a
+//! submap bend whole submaps, errors that neither shrink with the number of keypoints nor show in the residuals
+//! (sandwich and jackknife estimators over patches of 4 to 40 voxels were no better, NEES 170 to 14,000). Measured, the
+//! error is nevertheless shaped like H⁻¹: large where the geometry is weak. So the textbook form stays, but however
+//! many keypoints there are they count as at most [`INDEPENDENT_MAX`] measurements, and as fewer with the square of the
+//! overlap. A LiDAR does not bend what it sees: what its points have in common is the surface's shape between them and
+//! the odometry of the submap, and they count as [`INDEPENDENT_LIDAR_MAX`], and as fewer with the overlap.
 //!
 //! **Degeneracy.** Noise of the normals feigns information along a corridor. Information in a direction counts only
 //! from pairs whose normal leans clearly that way; where too little is left, the alignment is refused.
@@ -28,12 +28,12 @@ use thiserror::Error;
 /// Independent measurements that the keypoints of fully overlapping submaps amount to, however many they are, where a
 /// depth camera bends its views. Fitted to 7-Scenes (see the [module](self)).
 pub const INDEPENDENT_MAX: f64 = 15.5;
-/// The same for LiDAR, where they are fewer with the overlap, not with its square. Measured: NEES 2.6 to 3.1 for 6 degrees
-/// of freedom on KITTI 07; in ray-cast halls 1.4 where nothing drifts inside a submap, and 4.1 and 5.6 where the odometry
-/// does. (With the square, of a drive's pairs, 4.9 at one place and 1.6 ten metres apart.)
+/// The same for LiDAR, where they are fewer with the overlap, not with its square. Measured: NEES 2.6 to 3.1 for 6
+/// degrees of freedom on KITTI 07; in ray-cast halls 1.4 where nothing drifts inside a submap, and 4.1 and 5.6 where
+/// the odometry does. (With the square, of a drive's pairs, 4.9 at one place and 1.6 ten metres apart.)
 pub const INDEPENDENT_LIDAR_MAX: f64 = 85.0;
-/// Of these, where matched points hold the pose too: such poses were chosen among many, at lower overlaps and in frames that
-/// are turned at random. Measured: NEES 4.9 on 7-Scenes.
+/// Of these, where matched points hold the pose too: such poses were chosen among many, at lower overlaps and in frames
+/// that are turned at random. Measured: NEES 4.9 on 7-Scenes.
 const ANCHORED_SHARE: f64 = 0.775;
 /// Factor on the textbook covariance for what does shrink with the number of keypoints.
 const SAMPLING_INFLATION: f64 = 2.0;
@@ -157,8 +157,9 @@ pub fn refine(
     refine_anchored(theirs, mine, t_mine_theirs, &[], config)
 }
 
-/// [`refine`] with matched points (theirs, mine) besides the surfaces: along a direction that the surfaces leave free they
-/// hold the pose, and the covariance says how loosely. So with enough of them such a direction is no reason to refuse.
+/// [`refine`] with matched points (theirs, mine) besides the surfaces: along a direction that the surfaces leave free
+/// they hold the pose, and the covariance says how loosely. So with enough of them such a direction is no reason to
+/// refuse.
 ///
 /// # Errors
 /// As [`refine`].

@@ -5,8 +5,8 @@ use super::continuity::RESTART_KEYFRAMES;
 use super::planar::TILT_MAX;
 use thiserror::Error;
 
-/// Why a keyframe was refused. The submaps are as they were before; only the odometry across the refused keyframe becomes
-/// less certain, and several [jumps](Self::Jump) that go on from one another tell of a new frame.
+/// Why a keyframe was refused. The submaps are as they were before; only the odometry across the refused keyframe
+/// becomes less certain, and several [jumps](Self::Jump) that go on from one another tell of a new frame.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum KeyframeError {
     /// The stamp is not after the last one.

@@ -5,12 +5,12 @@
 //! on my surface and none where I saw air. So the consensus' pose, if there is one, joins the poses that few matches
 //! suggest (`hypotheses`); the most promising are judged by all keypoints (`verifier`).
 //!
-//! **Score.** A confirmed point weighs ln(q/f): q is its chance under a right pose and f how often it is confirmed under
-//! the *other* poses of this very pair, so that ground on ground, which fits anywhere, weighs nothing. A contradicted
-//! point costs `CONTRADICTION_COST`, a match that agrees gains `SUPPORT_GAIN`.
+//! **Score.** A confirmed point weighs ln(q/f): q is its chance under a right pose and f how often it is confirmed
+//! under the *other* poses of this very pair, so that ground on ground, which fits anywhere, weighs nothing. A
+//! contradicted point costs `CONTRADICTION_COST`, a match that agrees gains `SUPPORT_GAIN`.
 //!
-//! **Acceptance.** Score, share of keypoints near my surface, share of contradictions; and no other pose with nearly the
-//! same score that would itself pass, nor one elsewhere that nothing contradicts (`lookalike`), else the answer is
+//! **Acceptance.** Score, share of keypoints near my surface, share of contradictions; and no other pose with nearly
+//! the same score that would itself pass, nor one elsewhere that nothing contradicts (`lookalike`), else the answer is
 //! *ambiguous*.
 
 use super::aliasing;
@@ -36,8 +36,8 @@ const ROTATION_SIGMA_MAX: f64 = 0.25;
 /// Share of keypoints that may lie in one half-voxel cell with another: of a thinned cloud's hardly any do.
 const CROWDED_MAX: f64 = 0.1;
 
-/// A rival that puts the middle of their keypoints so far from where the best pose does, voxels, sees another place; nearer, the
-/// same place turned about, or slid along.
+/// A rival that puts the middle of their keypoints so far from where the best pose does, voxels, sees another place;
+/// nearer, the same place turned about, or slid along.
 const ELSEWHERE: f64 = 16.0;
 
 /// When an alignment is refused.

@@ -7,8 +7,8 @@
 //! 0.9 (0.27), parts of eight halls furnished alike 0.5 (0.10). Histograms of single numbers did better than those of
 //! words (signs of seven numbers, 0.84 and 0.34), of means, and of second moments.
 //!
-//! Behind it may follow the user's own descriptor of the [`place`]; where two summaries have one of the same kind, these
-//! are compared instead. Between the two may stand which way is up.
+//! Behind it may follow the user's own descriptor of the [`place`]; where two summaries have one of the same kind,
+//! these are compared instead. Between the two may stand which way is up.
 
 use super::descriptor::{Code, Projection};
 use super::gravity::{self, Up};

@@ -1,8 +1,8 @@
-//! Where else a submap would fit, upright as it stands: what repeats itself in steps. Descriptors seldom tell, since from
-//! where a robot stood the next shelf is seen from another side; surfaces do. Every keypoint votes for the shifts that bring
-//! it, along the ground, onto a surface that faces the same way; who votes for many says little of each. What faces up or
-//! down, and so fits anywhere, has no vote. Where it is not known which way is up, the ground is what most surfaces lie in.
-//! Lengths are in voxels.
+//! Where else a submap would fit, upright as it stands: what repeats itself in steps. Descriptors seldom tell, since
+//! from where a robot stood the next shelf is seen from another side; surfaces do. Every keypoint votes for the shifts
+//! that bring it, along the ground, onto a surface that faces the same way; who votes for many says little of each.
+//! What faces up or down, and so fits anywhere, has no vote. Where it is not known which way is up, the ground is what
+//! most surfaces lie in. Lengths are in voxels.
 
 use super::scene::{Cloud, Pose};
 use nalgebra::{Matrix3, Vector3};
@@ -24,8 +24,8 @@ const UPRIGHT_COS_MAX: f64 = 0.7;
 /// Votes that are as good as one.
 const VOTES_OF_ONE: f64 = 10.0;
 
-/// The pose, which puts their points where `placed` says, moved by the shifts with most votes that are `least` or longer.
-/// `up` is of length 1, in my frame.
+/// The pose, which puts their points where `placed` says, moved by the shifts with most votes that are `least` or
+/// longer. `up` is of length 1, in my frame.
 pub(super) fn shifts(
     (placed, pose): (&[Vector3<f64>], &Pose),
     theirs: &Cloud,

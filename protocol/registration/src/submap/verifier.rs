@@ -1,6 +1,6 @@
-//! The judgement of poses of one pair of submaps: which of many is worth a closer look, what my surfaces and my views say
-//! of it, and what they would say of others ([`register`](super::register) holds the definition of the score). Lengths
-//! are in voxels.
+//! The judgement of poses of one pair of submaps: which of many is worth a closer look, what my surfaces and my views
+//! say of it, and what they would say of others ([`register`](super::register) holds the definition of the score).
+//! Lengths are in voxels.
 
 use super::matching::Pairing;
 use super::scene::{Cloud, NEAR, Pose, Scene, Verdict};
@@ -30,8 +30,8 @@ const RADII: [f32; 3] = [2.0, 1.5, 1.5];
 const SAME: (f64, f64) = (0.5, 0.03);
 /// Poses that tell what chance does.
 const CHANCE_MAX: usize = 200;
-/// Where few poses are suggested, or all are one, the first one put elsewhere (voxels) tells what chance does, too: on open
-/// ground it fits there as well.
+/// Where few poses are suggested, or all are one, the first one put elsewhere (voxels) tells what chance does, too: on
+/// open ground it fits there as well.
 const WITNESSES: [[f64; 3]; 12] = [
     [16.0, 0.0, 0.0],
     [-16.0, 0.0, 0.0],
@@ -52,8 +52,8 @@ const CONFIRMED: f64 = 0.8;
 const CONTRADICTION_COST: f64 = 3.0;
 /// Points of one wall are not independent: so many count as one.
 const POINTS_PER_MEASUREMENT: f64 = 3.0;
-/// What a keypoint with a match that agrees with the pose adds: under a wrong pose one in a hundred has one, under a right
-/// one at least one in twenty.
+/// What a keypoint with a match that agrees with the pose adds: under a wrong pose one in a hundred has one, under a
+/// right one at least one in twenty.
 const SUPPORT_GAIN: f64 = 3.0;
 /// What it takes at first coarse_score, in confirmed points.
 const GLANCE_COST: f64 = 2.0;
@@ -162,8 +162,8 @@ impl<'a> PoseVerifier<'a> {
         self.close_look(self.polish(*pose, self.theirs.points.len(), &RADII), matches)
     }
 
-    /// The first [`POLISHED_MAX`] of those coarse at, but of poses near one of them only [`ALIKE_MAX`]: the rest of a good
-    /// one's neighbourhood must not crowd out its rivals.
+    /// The first [`POLISHED_MAX`] of those coarse at, but of poses near one of them only [`ALIKE_MAX`]: the rest of a
+    /// good one's neighbourhood must not crowd out its rivals.
     fn varied(&self, poses: &[Pose], coarse: &[(f64, usize)]) -> Vec<usize> {
         let mut chosen: Vec<usize> = Vec::new();
         for &(_, k) in coarse {
@@ -262,8 +262,8 @@ impl PoseVerifier<'_> {
         slides.chain(turns).map(|pose| self.close_look(pose, self.matches).surface).fold(0.0, f64::max)
     }
 
-    /// Of the points that confirm a pose, the share that faces the direction which fewest do: a third at best, nothing on a
-    /// plane.
+    /// Of the points that confirm a pose, the share that faces the direction which fewest do: a third at best, nothing
+    /// on a plane.
     pub fn least_facing(&self, judged: &Judged) -> f64 {
         let spread = self.faces(judged);
         spread.symmetric_eigenvalues().min() / spread.trace().max(1.0)

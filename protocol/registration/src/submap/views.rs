@@ -1,6 +1,6 @@
 //! What my sensor looked through, from each of my keyframes: the six faces of a cube around it, in pixels of about one
-//! degree that hold the nearest range. The same question as [`contradiction`](super::contradiction) asks, for many poses:
-//! no trigonometry, no search. Lengths are in voxels.
+//! degree that hold the nearest range. The same question as [`contradiction`](super::contradiction) asks, for many
+//! poses: no trigonometry, no search. Lengths are in voxels.
 
 use super::features::Features;
 use nalgebra::Vector3;
@@ -13,7 +13,8 @@ const VIEWS_MAX: usize = 16;
 const BEHIND: f32 = 4.0;
 /// ...and nothing nearer passes by the line of sight at less than this.
 const SHADOW: f32 = 1.5;
-/// Half width, in pixels, of the window about the line of sight at most: what stands nearer to the sensor is not judged.
+/// Half width, in pixels, of the window about the line of sight at most: what stands nearer to the sensor is not
+/// judged.
 const WINDOW_MAX: usize = 8;
 
 /// All views of a submap.

@@ -1,6 +1,6 @@
-//! Would I have seen their points? A wrong alignment often lays walls on walls and fits well, but it also puts points of
-//! theirs where my sensor looked straight through. This counts such contradictions; it needs my viewpoints, which only
-//! I have: the peer judges from its own.
+//! Would I have seen their points? A wrong alignment often lays walls on walls and fits well, but it also puts points
+//! of theirs where my sensor looked straight through. This counts such contradictions; it needs my viewpoints, which
+//! only I have: the peer judges from its own.
 
 use super::cloud::Index;
 use super::features::{Features, Keypoints};

@@ -1,8 +1,8 @@
-//! `merganser-sim bench calibration`: whether what robots believe of one another is as uncertain as they say. Whole swarms
-//! of real agents run with messages lost, halves cut apart for a while, and logs condensed; only alignments are made up:
-//! the truth, with the noise that they state. At the end the errors of frames, submaps and live poses, in the first
-//! robot's frame, are normalised by the covariances claimed for them (NEES). A run is one sample of each: its mean, as
-//! errors within a run are much alike.
+//! `merganser-sim bench calibration`: whether what robots believe of one another is as uncertain as they say. Whole
+//! swarms of real agents run with messages lost, halves cut apart for a while, and logs condensed; only alignments are
+//! made up: the truth, with the noise that they state. At the end the errors of frames, submaps and live poses, in the
+//! first robot's frame, are normalised by the covariances claimed for them (NEES). A run is one sample of each: its
+//! mean, as errors within a run are much alike.
 
 use crate::bar::progress_bar;
 use crate::bench::anchors::anchors;
@@ -117,7 +117,8 @@ pub fn run(options: &Calibration) -> anyhow::Result<bool> {
     Ok(all)
 }
 
-/// Runs swarms of these seeds, with alignments as sure as `sigma` says or as the scenario does; `tick` is called after each.
+/// Runs swarms of these seeds, with alignments as sure as `sigma` says or as the scenario does; `tick` is called after
+/// each.
 ///
 /// # Errors
 /// A run that cannot be made, that broke an invariant or did not merge.

@@ -1,7 +1,8 @@
-//! `merganser-sim bench gossip`: what it costs to make the sets of facts of a whole swarm equal (DESIGN §4). Robots hold
-//! real replicas of real signed entries; only the radio, the motion and the time are made up. Beside our gossip runs a
-//! plain one in the same worlds, on the same messages: root hashes at a fixed interval, then the whole have-vector with
-//! hashes to whoever differs. Where contacts come and go, the time that no gossip can beat is told as well.
+//! `merganser-sim bench gossip`: what it costs to make the sets of facts of a whole swarm equal (DESIGN §4). Robots
+//! hold real replicas of real signed entries; only the radio, the motion and the time are made up. Beside our gossip
+//! runs a plain one in the same worlds, on the same messages: root hashes at a fixed interval, then the whole
+//! have-vector with hashes to whoever differs. Where contacts come and go, the time that no gossip can beat is told as
+//! well.
 
 mod bound;
 mod case;

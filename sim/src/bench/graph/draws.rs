@@ -3,9 +3,9 @@
 //! known, also how far the published graph's solution is from it, beside what honest covariances give in one draw.
 //!
 //! Two numbers, each 1 for honest covariances. ANEES: the mean over all poses, each relative to the first. Their errors
-//! are much alike (whoever mistakes the first heading mistakes all), so that one draw says little and the mean of many is
-//! asked. Joint: the error of all poses at once under the whole covariance, `χ²(truth) − χ²(minimum)` by its degrees of
-//! freedom; in a large graph one draw tells.
+//! are much alike (whoever mistakes the first heading mistakes all), so that one draw says little and the mean of many
+//! is asked. Joint: the error of all poses at once under the whole covariance, `χ²(truth) − χ²(minimum)` by its degrees
+//! of freedom; in a large graph one draw tells.
 
 use super::ate::anees;
 use super::files::Source;

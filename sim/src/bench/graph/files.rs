@@ -40,7 +40,8 @@ impl Source {
         self.closures.is_some()
     }
 
-    /// Where the robots truly were, where a file tells (Kollagen's `*_GT.tum` beside each robot's graph, a line a pose).
+    /// Where the robots truly were, where a file tells (Kollagen's `*_GT.tum` beside each robot's graph, a line a
+    /// pose).
     pub(super) fn truth(&self) -> anyhow::Result<BTreeMap<u64, Se3>> {
         let mut out = BTreeMap::new();
         for (robot, path) in (0..).zip(self.files.iter().filter(|_| self.closures.is_some())) {

@@ -1,5 +1,5 @@
-//! Eight real robots in look-alike tunnels: which of their closures count, beside the weights that another robust solver
-//! left in the tables, and why the two differ most where they do.
+//! Eight real robots in look-alike tunnels: which of their closures count, beside the weights that another robust
+//! solver left in the tables, and why the two differ most where they do.
 //!
 //! The solver had not ended: weights of closures between robots are all below 0.01. So it is taken to keep as many
 //! closures as we do, those of the largest weights.

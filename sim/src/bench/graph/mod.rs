@@ -40,7 +40,8 @@ pub struct GraphBench {
     #[arg(long, value_name = "PYTHON")]
     pub peer_python: Option<PathBuf>,
     /// Replace this share of the closures between robots by random ones, %, and solve robustly instead. Exit code 1 if
-    /// closures or poses of any graph are worse than those of a solver that is told which are true, by the bounds printed
+    /// closures or poses of any graph are worse than those of a solver that is told which are true, by the bounds
+    /// printed
     #[arg(long, value_name = "PERCENT", value_parser = clap::value_parser!(u32).range(0..=99))]
     pub spoil: Option<u32>,
     /// Draw every measurement anew around the solution so many times, with the noise that the graph states, and tell

@@ -1,7 +1,7 @@
 //! Are our covariances GTSAM's? On one graph at the same poses, computed by both.
 //!
-//! GTSAM leaves out the Jacobian of a measurement's logarithm, which is the identity where residuals vanish. So the graph
-//! compared is the file's with every measurement replaced by what the solved poses say of it.
+//! GTSAM leaves out the Jacobian of a measurement's logarithm, which is the identity where residuals vanish. So the
+//! graph compared is the file's with every measurement replaced by what the solved poses say of it.
 
 use super::peer::json_line;
 use anyhow::Context;

@@ -1,6 +1,6 @@
-//! `merganser-sim bench mission`: a swarm that drives for minutes with ray-cast scans, as it would be used. When do robots
-//! merge that see the same, how far off is the map at the end beside that of a solver who is given every true loop, and
-//! what does each robot send for it?
+//! `merganser-sim bench mission`: a swarm that drives for minutes with ray-cast scans, as it would be used. When do
+//! robots merge that see the same, how far off is the map at the end beside that of a solver who is given every true
+//! loop, and what does each robot send for it?
 
 mod oracle;
 mod registered;

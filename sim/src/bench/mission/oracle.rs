@@ -1,5 +1,5 @@
-//! The solver that is given every true loop: the same odometry, and between any two submaps that overlap an alignment with
-//! errors like those of the swarm's own.
+//! The solver that is given every true loop: the same odometry, and between any two submaps that overlap an alignment
+//! with errors like those of the swarm's own.
 
 use crate::bench::anchors::Anchor;
 use crate::dice::Dice;

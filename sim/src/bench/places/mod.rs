@@ -32,8 +32,8 @@ pub struct Places {
     /// Runs, each with the next seed
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100))]
     pub runs: u64,
-    /// Tell each submap which way is up, with a draw of this standard deviation, rad, about each horizontal axis. What is up in
-    /// the depth camera's world is taken from its walls and floor
+    /// Tell each submap which way is up, with a draw of this standard deviation, rad, about each horizontal axis. What
+    /// is up in the depth camera's world is taken from its walls and floor
     #[arg(long, value_name = "RAD", value_parser = sigma_rad)]
     pub gravity: Option<f64>,
     /// Measure KISS-Matcher on the same LiDAR pairs, in this Python interpreter

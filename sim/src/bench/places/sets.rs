@@ -17,8 +17,8 @@ use std::path::Path;
 /// Thins a turn of KITTI's LiDAR to about 20,000 points.
 const DENSE_VOXEL_M: f64 = 0.3;
 
-/// Against gravity in the world of the depth camera, whose axes are those of some camera: the mean normal of what lies within
-/// 6° of level in 17 of its images. Two walls stand at 88.5° and 92.5° to it.
+/// Against gravity in the world of the depth camera, whose axes are those of some camera: the mean normal of what lies
+/// within 6° of level in 17 of its images. Two walls stand at 88.5° and 92.5° to it.
 const SEVEN_SCENES_UP: [f64; 3] = [0.005, -0.890, -0.457];
 
 /// A described submap.

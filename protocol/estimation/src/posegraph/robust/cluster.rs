@@ -2,10 +2,11 @@
 //! their neighbours.
 //!
 //! A pair merges on at least so many closures because fewer that agree are too easily brought about by places that look
-//! alike. What that rule asks of two parts it asks of every cut through a merged map: that so many closures cross it which
-//! agree with all the rest. So merges on fewer closures are tried in a copy of the world, where what contradicts them
-//! drops out and what agrees is let in; of what becomes one there, the clusters that no cut of fewer closures divides
-//! stand. Closures of more than one pair of parts must cross each cut: what a pair says by itself was asked before.
+//! alike. What that rule asks of two parts it asks of every cut through a merged map: that so many closures cross it
+//! which agree with all the rest. So merges on fewer closures are tried in a copy of the world, where what contradicts
+//! them drops out and what agrees is let in; of what becomes one there, the clusters that no cut of fewer closures
+//! divides stand. Closures of more than one pair of parts must cross each cut: what a pair says by itself was asked
+//! before.
 
 use super::world::World;
 use crate::ids::FrameId;
@@ -87,8 +88,8 @@ fn tied_together(ties: &[(usize, usize)]) -> Vec<BTreeSet<usize>> {
     components
 }
 
-/// Divides nodes along cuts that fewer than `least` ties cross, or those of fewer than [`PAIRS_MIN`] pairs, until no such
-/// cut is left.
+/// Divides nodes along cuts that fewer than `least` ties cross, or those of fewer than [`PAIRS_MIN`] pairs, until no
+/// such cut is left.
 fn clusters(nodes: BTreeSet<usize>, ties: &[(usize, usize)], least: usize) -> Vec<BTreeSet<usize>> {
     let inside: Vec<(usize, usize)> =
         ties.iter().copied().filter(|(a, b)| nodes.contains(a) && nodes.contains(b)).collect();

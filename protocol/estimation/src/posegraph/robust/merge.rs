@@ -2,8 +2,8 @@
 //!
 //! Closures between two parts agree or contradict each other through the parts between their ends, whose relative
 //! covariances hold all that ties their robots; so pairs of robots with a closure or two each are told by those of
-//! their neighbours. The largest set that agrees pairwise (Mangelson et al. 2018) merges its parts if chance would do as
-//! well in fewer than the configured number of false alarms, and no other set has about as many members. The surest
+//! their neighbours. The largest set that agrees pairwise (Mangelson et al. 2018) merges its parts if chance would do
+//! as well in fewer than the configured number of false alarms, and no other set has about as many members. The surest
 //! merges come first, along a spanning forest; each makes the next surer.
 
 use super::world::{Part, World};
@@ -141,8 +141,8 @@ impl Distances {
     /// bring forth; `None` of a clique of one.
     ///
     /// A false closure comes as near to a hypothesis as d² = r² with the probability α(r) of that ellipsoid in the
-    /// search volume. k among n closures agree with one of them within a radius fixed beforehand in n C(n − 1, k − 1) Π α
-    /// cases; with the radius of the farthest of them, which the data choose, in (n − 1) times as many (MATH §5). The
+    /// search volume. k among n closures agree with one of them within a radius fixed beforehand in n C(n − 1, k − 1) Π
+    /// α cases; with the radius of the farthest of them, which the data choose, in (n − 1) times as many (MATH §5). The
     /// smaller of the two counts, doubled.
     fn surest(&self, clique: Set, volume: f64, scale: f64) -> Option<Surest> {
         let n = self.n as f64;

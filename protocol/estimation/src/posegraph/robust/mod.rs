@@ -8,8 +8,8 @@
 //! 2. Pairs of robots go through the consensus of a swarm's frames (`seed`).
 //! 3. Closures that the map contradicts are dropped and those that agree with it are let in, whoever left them out,
 //!    judged with the map's covariance (`world`); what now counts tells the noise better, and more may agree.
-//! 4. Parts of the map that few closures tie are merged where those agree through them (`merge`), several together where
-//!    no two can be told (`cluster`), and all begins again at 3 until nothing changes.
+//! 4. Parts of the map that few closures tie are merged where those agree through them (`merge`), several together
+//!    where no two can be told (`cluster`), and all begins again at 3 until nothing changes.
 //!
 //! The map is then solved from the closures that count, with the information that the graph states.
 
@@ -70,8 +70,8 @@ pub struct RobustSolved {
     pub map: Fit,
     /// The frame and index of each pose.
     pub anchors: BTreeMap<u64, SubmapId>,
-    /// By how much standard deviations differ from the stated ones, as all that counts shows (root of the mean variance over
-    /// the six directions): decisions were made with these.
+    /// By how much standard deviations differ from the stated ones, as all that counts shows (root of the mean variance
+    /// over the six directions): decisions were made with these.
     pub sigma_scale: f64,
     solutions: Vec<Solution>,
 }

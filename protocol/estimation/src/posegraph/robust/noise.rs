@@ -14,9 +14,9 @@ use nalgebra::{Matrix6, Vector6};
 /// Factors on standard deviations, at least and at most.
 const FACTOR_MIN: f64 = 0.01;
 const FACTOR_MAX: f64 = 10.0;
-/// By how many residuals an estimate is drawn, on a log scale, towards what is known of more: the mean of all directions
-/// towards what is stated, that of translations or rotations towards the mean of all, that of one direction towards
-/// that.
+/// By how many residuals an estimate is drawn, on a log scale, towards what is known of more: the mean of all
+/// directions towards what is stated, that of translations or rotations towards the mean of all, that of one direction
+/// towards that.
 const DRAWN_BY: f64 = 6.0;
 
 /// Factors on the standard deviations of whitened residuals, by direction.

@@ -160,7 +160,8 @@ fn closures_with_robots_that_are_merged_count_together() {
     assert!(truths.iter().all(is_used) && !lies.iter().any(is_used), "{truths:?} {lies:?}");
 }
 
-/// `robots` of which each stays in sight of the next, the last of the first: two true closures and two lies of each pair.
+/// `robots` of which each stays in sight of the next, the last of the first: two true closures and two lies of each
+/// pair.
 fn ring(robots: u8, pairs: u8) -> (PoseGraph, usize) {
     let walked = walk(7, 10);
     let odometry = 2 * (POSES as usize - 1);

@@ -197,13 +197,13 @@ impl World<'_> {
         any
     }
 
-    /// Lets in closures that agree with the map and with each other, where the map alone is too unsure to tell each from
-    /// chance; whether there are any.
+    /// Lets in closures that agree with the map and with each other, where the map alone is too unsure to tell each
+    /// from chance; whether there are any.
     ///
     /// Each is tried in turn: those that then agree are told from chance by it. The trial with the most evidence in all
-    /// counts. The first may be further off than the noise that is believed explains: odometry drifts more over long ways
-    /// than from step to step, and closures far from all others are the first to show it. It then needs as many with it
-    /// as two frames do to merge.
+    /// counts. The first may be further off than the noise that is believed explains: odometry drifts more over long
+    /// ways than from step to step, and closures far from all others are the first to show it. It then needs as many
+    /// with it as two frames do to merge.
     pub(super) fn admit_together(&mut self) -> bool {
         let mut any = false;
         let widest = self.scales.iter().fold(1.0, |x: f64, s| x.max(s * s)).min(FAR);
@@ -355,8 +355,8 @@ fn extent(values: &[Sim3]) -> f64 {
     (high - low).map(|edge| edge.max(SEARCH_EDGE_MIN)).product()
 }
 
-/// Volume of places over which false closures spread, for one of them to fall anywhere in it as likely as in the densest
-/// box about the place where its ends would coincide: so few that lie far out make it no larger.
+/// Volume of places over which false closures spread, for one of them to fall anywhere in it as likely as in the
+/// densest box about the place where its ends would coincide: so few that lie far out make it no larger.
 pub(super) fn spread(closures: &[Closure]) -> f64 {
     let places: Vec<Vector3<f64>> =
         closures.iter().filter(|c| c.i.frame != c.j.frame).map(|c| c.t_i_j.pose.translation.abs()).collect();

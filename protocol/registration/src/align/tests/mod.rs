@@ -56,7 +56,8 @@ struct Case {
 }
 
 impl Case {
-    /// `n` matches in the unit cube, `inliers` of them true with noise [`SIGMA`]; the others land anywhere in the scene.
+    /// `n` matches in the unit cube, `inliers` of them true with noise [`SIGMA`]; the others land anywhere in the
+    /// scene.
     fn uniform(seed: u64, n: usize, inliers: usize, scale: f64) -> Self {
         let mut draw = Draw::new(seed);
         let truth = Sim3 { scale, ..draw.motion() };

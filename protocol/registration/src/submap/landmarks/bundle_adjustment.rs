@@ -1,13 +1,13 @@
-//! Where the landmarks of a submap lie: the least-squares solution of the motions between its keyframes and all sightings,
-//! with the anchor fixed (bundle adjustment; landmarks are eliminated first, Schur). So a landmark seen at the end of a
-//! submap is as uncertain about its anchor as the way between is, and sightings of one landmark from two places tell how
-//! the body turned meanwhile.
+//! Where the landmarks of a submap lie: the least-squares solution of the motions between its keyframes and all
+//! sightings, with the anchor fixed (bundle adjustment; landmarks are eliminated first, Schur). So a landmark seen at
+//! the end of a submap is as uncertain about its anchor as the way between is, and sightings of one landmark from two
+//! places tell how the body turned meanwhile.
 //!
 //! Motions and sightings are taken as independent. Only the landmarks are used of the solution: the odometry between
 //! submaps stays what the motions say, so what was seen counts once, in the alignments.
 //!
-//! A sighting that contradicts the others of its landmark is left out; a landmark whose sightings mostly contradict each
-//! other is left out altogether: its label lies.
+//! A sighting that contradicts the others of its landmark is left out; a landmark whose sightings mostly contradict
+//! each other is left out altogether: its label lies.
 
 use super::gather::{Seen, Sighting};
 use super::{Constellation, Landmark, Mark, SIGMA_RANGE};
@@ -32,8 +32,8 @@ const RANK: f64 = 1e-6;
 /// What the constellation takes up of a landmark's own noise is given back in part: others may share only some of it.
 const OWN_KEPT: f64 = 0.5;
 
-/// Landmarks in the anchor frame, those of most sightings first. `motions[k]` leads from keyframe k to the next, `start`
-/// is `t_anchor_body` of each by the motions alone, and `anchor` is the one that stays.
+/// Landmarks in the anchor frame, those of most sightings first. `motions[k]` leads from keyframe k to the next,
+/// `start` is `t_anchor_body` of each by the motions alone, and `anchor` is the one that stays.
 pub fn adjust(seen: &[Seen], motions: &[PoseWithCovariance], start: &[Se3], anchor: usize) -> Constellation {
     let mut problem = Problem::new(seen, motions, start, anchor);
     problem.screen();
@@ -86,8 +86,8 @@ impl<'a> Problem<'a> {
         (2..=KEYFRAMES_MAX).contains(&self.bodies.len()) && self.motions.len() + 1 == self.bodies.len()
     }
 
-    /// Leaves out what contradicts the middle place of its landmark however the body may have drifted, before it bends the
-    /// solution. A landmark of which that is much loses all.
+    /// Leaves out what contradicts the middle place of its landmark however the body may have drifted, before it bends
+    /// the solution. A landmark of which that is much loses all.
     fn screen(&mut self) {
         let (Some(drifts), bodies) = (self.drifts(), &self.bodies) else { return };
         for sought in &mut self.sought {
@@ -127,8 +127,9 @@ impl<'a> Problem<'a> {
         Some(drifts)
     }
 
-    /// Splits the landmarks' covariances into what they have in common, which is returned, and what is each one's own, which
-    /// stays. With e the errors and J δ the rigid motion that explains them best: the covariances of δ and of e − J δ.
+    /// Splits the landmarks' covariances into what they have in common, which is returned, and what is each one's own,
+    /// which stays. With e the errors and J δ the rigid motion that explains them best: the covariances of δ and of e −
+    /// J δ.
     fn tell_apart(&mut self) -> Option<Covariance<6>> {
         let parts: Vec<Option<Parts>> = self.sought.iter().map(|s| self.parts(s)).collect();
         let inverse = if self.adjusts() { Some(self.adjust(&parts)?.0) } else { None };
@@ -260,8 +261,8 @@ impl<'a> Problem<'a> {
         step.iter().all(|x| x.is_finite()).then(|| (solver.inverse(), step))
     }
 
-    /// Jacobian of a sighting's error about its body's local perturbation, information, and the error. About the landmark
-    /// it is the body's rotation, transposed.
+    /// Jacobian of a sighting's error about its body's local perturbation, information, and the error. About the
+    /// landmark it is the body's rotation, transposed.
     fn sighting(&self, sought: &Sought, sighting: &Sighting) -> Option<(Matrix3x6<f64>, Matrix3<f64>, Vector3<f64>)> {
         let at = self.bodies[usize::from(sighting.keyframe)].inverse() * sought.at;
         let mut j = Matrix3x6::zeros();

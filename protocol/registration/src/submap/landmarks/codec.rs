@@ -1,10 +1,10 @@
-//! The binary layout of landmarks, for blobs (sent) and for records (kept). Landmarks are held quantised, as points are,
-//! so that what was decoded equals what was encoded.
+//! The binary layout of landmarks, for blobs (sent) and for records (kept). Landmarks are held quantised, as points
+//! are, so that what was decoded equals what was encoded.
 //!
-//! Little-endian. Header: magic, version, 3 spare, voxel edge and position step (f32, frame units), count (u32), and the upper
-//! triangle of the covariance that all have in common (21 × f32). Landmark:
-//! what follows (bit 0 a label, bit 1 a descriptor), position 3 × i16 steps, standard deviations 3 × u8 (logarithmic),
-//! correlations xy, xz, yz 3 × i8, label u32, descriptor 32 bytes.
+//! Little-endian. Header: magic, version, 3 spare, voxel edge and position step (f32, frame units), count (u32), and
+//! the upper triangle of the covariance that all have in common (21 × f32). Landmark: what follows (bit 0 a label, bit
+//! 1 a descriptor), position 3 × i16 steps, standard deviations 3 × u8 (logarithmic), correlations xy, xz, yz 3 × i8,
+//! label u32, descriptor 32 bytes.
 
 use super::super::block::{BlockError, HEADER_LEN};
 use super::{Constellation, DESCRIPTOR_LEN, Landmark, Mark};

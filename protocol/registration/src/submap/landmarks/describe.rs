@@ -15,8 +15,8 @@ const GROUPS: usize = 16;
 /// Levels of each.
 const LEVELS: usize = WORDS / GROUPS;
 
-/// Features, keypoints and summary of a submap of landmarks. As many of those seen most often become keypoints as fit into
-/// the bytes that `config.keypoints` points of surfaces take.
+/// Features, keypoints and summary of a submap of landmarks. As many of those seen most often become keypoints as fit
+/// into the bytes that `config.keypoints` points of surfaces take.
 pub fn describe(submap: &Submap, config: &SubmapConfig) -> Described {
     let landmarks = &submap.constellation.landmarks;
     let extent = [0, 1, 2].map(|axis| landmarks.iter().fold(0.0, |most: f32, l| most.max(l.at[axis].abs() as f32)));

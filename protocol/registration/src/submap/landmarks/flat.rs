@@ -1,7 +1,7 @@
-//! The pose in the plane that matched landmarks agree on. Matches are few, so every pair of them is tried as a hypothesis;
-//! the best are fitted with the covariances of both sides, and accepted by the number of false alarms: how often so many
-//! wrong matches would agree by accident (MATH §4), where a label is wrong with probability [`LABEL_WRONG`] and a wrong
-//! match may lie anywhere in the submap.
+//! The pose in the plane that matched landmarks agree on. Matches are few, so every pair of them is tried as a
+//! hypothesis; the best are fitted with the covariances of both sides, and accepted by the number of false alarms: how
+//! often so many wrong matches would agree by accident (MATH §4), where a label is wrong with probability
+//! [`LABEL_WRONG`] and a wrong match may lie anywhere in the submap.
 
 use super::super::planar::Se2;
 use super::LandmarkError;

@@ -1,5 +1,5 @@
-//! Tells which sightings of a growing submap are of one landmark: by their label if they have one; else by place (within the
-//! uncertainty of both) and, where both are described, by descriptor. Memory is bounded whatever comes.
+//! Tells which sightings of a growing submap are of one landmark: by their label if they have one; else by place
+//! (within the uncertainty of both) and, where both are described, by descriptor. Memory is bounded whatever comes.
 
 use super::{Descriptor, LANDMARKS_MAX, Mark, differing};
 use crate::geometry::Se3;

@@ -1,11 +1,12 @@
-//! Sparse landmarks (`submap.sensor = "landmarks"` or `"landmarks_2d"`): what a visual SLAM keeps of the world. There is no
-//! surface to look at, so the path from keyframes to alignments is another one.
+//! Sparse landmarks (`submap.sensor = "landmarks"` or `"landmarks_2d"`): what a visual SLAM keeps of the world. There
+//! is no surface to look at, so the path from keyframes to alignments is another one.
 //!
-//! A keyframe's points are sightings of landmarks, each with a [`Mark`]. `gather` tells which sightings are of one landmark
-//! (by label, else by place and descriptor), `settle` finds where the landmarks of a submap lie, given its motions.
-//! [`describe()`] makes of them features, keypoints (`chart` is the layout) and summary. [`register()`] pairs a peer's
-//! landmarks with mine by labels and descriptors, and finds the pose: in space by the σ-consensus, in SE(3) or, where a
-//! scale is unknown, SIM(3); in the plane by a consensus of its own (`flat`), with nothing claimed of height and tilt.
+//! A keyframe's points are sightings of landmarks, each with a [`Mark`]. `gather` tells which sightings are of one
+//! landmark (by label, else by place and descriptor), `settle` finds where the landmarks of a submap lie, given its
+//! motions. [`describe()`] makes of them features, keypoints (`chart` is the layout) and summary. [`register()`] pairs
+//! a peer's landmarks with mine by labels and descriptors, and finds the pose: in space by the σ-consensus, in SE(3)
+//! or, where a scale is unknown, SIM(3); in the plane by a consensus of its own (`flat`), with nothing claimed of
+//! height and tilt.
 //!
 //! Without labels and descriptors nothing is paired: a constellation of bare points is not recognised.
 //!
@@ -44,8 +45,8 @@ pub type Descriptor = [u8; DESCRIPTOR_LEN];
 /// What is known of a landmark besides where it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mark {
-    /// Covariance of its place, in the axes in which the place is given, frame units squared. Within a submap: about the
-    /// constellation as a whole.
+    /// Covariance of its place, in the axes in which the place is given, frame units squared. Within a submap: about
+    /// the constellation as a whole.
     pub covariance: Covariance<3>,
     /// Who it is, such as a bar code's number: equal labels are one landmark, in all maps of the swarm.
     pub label: Option<u32>,
@@ -74,9 +75,9 @@ pub struct Landmark {
 pub struct Constellation {
     /// Those seen most often first.
     pub landmarks: Vec<Landmark>,
-    /// What the errors of all have in common: by how much the constellation as a whole may be moved and turned about the
-    /// anchor. Covariance of the δ = (ρ, φ) by which exp(δ) moves the true places to the stated ones, as far as they move
-    /// together.
+    /// What the errors of all have in common: by how much the constellation as a whole may be moved and turned about
+    /// the anchor. Covariance of the δ = (ρ, φ) by which exp(δ) moves the true places to the stated ones, as far as
+    /// they move together.
     pub common: Covariance<6>,
 }
 
@@ -90,7 +91,8 @@ impl Default for Constellation {
     }
 }
 
-/// Standard deviation (frame units) of the height of landmarks in the plane: next to nothing, but enough to compute with.
+/// Standard deviation (frame units) of the height of landmarks in the plane: next to nothing, but enough to compute
+/// with.
 const FLAT_SIGMA: f64 = 1e-3;
 
 /// Sightings laid into the plane of the body: heights are left out.

@@ -15,21 +15,22 @@ use thiserror::Error;
 
 /// Of the matches by label, at least this share agrees: where more lie, all are doubted.
 const LABELS_AGREE_MIN: f64 = 0.6;
-/// Landmarks that one may be, by their looks. More than one, so that where a place repeats itself each repetition is found,
-/// and the answer is that it does.
+/// Landmarks that one may be, by their looks. More than one, so that where a place repeats itself each repetition is
+/// found, and the answer is that it does.
 const LOOK_ALIKES_MAX: usize = 4;
-/// A second pose with this share of the support of the first makes the answer ambiguous: descriptors do not agree on a pose
-/// by chance, so it tells that the place repeats itself, and which repetition is seen is then anyone's guess.
+/// A second pose with this share of the support of the first makes the answer ambiguous: descriptors do not agree on a
+/// pose by chance, so it tells that the place repeats itself, and which repetition is seen is then anyone's guess.
 const RIVAL_RATIO_IN_SPACE: f64 = 0.1;
-/// A rival that puts the middle of theirs so far from where the first pose does, in units of their spread, sees another place;
-/// nearer, the same place turned.
+/// A rival that puts the middle of theirs so far from where the first pose does, in units of their spread, sees another
+/// place; nearer, the same place turned.
 const ELSEWHERE: f64 = 0.5;
 /// Landmarks that lie in a plane to within so many times their noise look the same in a mirror.
 const FLAT_SIGMAS: f64 = 3.0;
 /// The noise scale may exceed the stated one by this factor.
 const SIGMA_FACTOR: f64 = 3.0;
-/// The search for similarities tells agreement from chance by matches that do not agree. Landmarks that are surely not the
-/// same show it what chance looks like: a third as many as there are matches, and so many that there are this many in all.
+/// The search for similarities tells agreement from chance by matches that do not agree. Landmarks that are surely not
+/// the same show it what chance looks like: a third as many as there are matches, and so many that there are this many
+/// in all.
 const CONTRASTED_MIN: usize = 48;
 /// A match that agrees, by the consensus in space.
 const AGREES: f64 = 0.5;
@@ -43,7 +44,8 @@ const ANGLE_SIGMA_MAX: f64 = 0.25;
 pub struct LandmarkConfig {
     /// In three degrees of freedom: all landmarks lie at z = 0, units are metres.
     pub planar: bool,
-    /// The consensus in space (its `sigma_max` is raised where landmarks are less certain), and for both when to accept.
+    /// The consensus in space (its `sigma_max` is raised where landmarks are less certain), and for both when to
+    /// accept.
     pub solver: SolverConfig,
 }
 

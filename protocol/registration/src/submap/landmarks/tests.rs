@@ -46,8 +46,8 @@ fn covariance(dice: &mut Dice, sigma: f64, flat: bool) -> Covariance<3> {
     Covariance::new(m).unwrap()
 }
 
-/// How a robot sees things: from a frame of its own, with noise as stated, labelled by their numbers or described by bits
-/// of which a tenth is wrong.
+/// How a robot sees things: from a frame of its own, with noise as stated, labelled by their numbers or described by
+/// bits of which a tenth is wrong.
 struct Look {
     /// `t_frame_world`.
     frame: Sim3,
@@ -209,8 +209,8 @@ fn lies_are_refused() {
     }
 }
 
-/// Theirs shows one of two bays that look the same, mine shows both: whichever it is, nobody can tell. Alone among other
-/// things, what looks alike does no harm.
+/// Theirs shows one of two bays that look the same, mine shows both: whichever it is, nobody can tell. Alone among
+/// other things, what looks alike does no harm.
 #[test]
 fn what_repeats_itself_is_ambiguous_and_a_few_look_alikes_are_not() {
     let mut dice = Dice::seed_from_u64(9);

@@ -112,8 +112,8 @@ pub fn unpacked(bytes: &[u8; PACKED_LEN], step: f64) -> Option<Vector2<f64>> {
     (known == 1).then(|| Vector2::new(x, y))
 }
 
-/// How often pairs of oriented points lie so far apart and face one another so: blind to where the submap lies and how it
-/// is turned (Wahl et al. 2003, in the plane).
+/// How often pairs of oriented points lie so far apart and face one another so: blind to where the submap lies and how
+/// it is turned (Wahl et al. 2003, in the plane).
 fn shares(points: &[(Vector2<f64>, Vector2<f64>)]) -> [f32; WORDS] {
     let mut shares = [0.0; WORDS];
     let level = |x: f64| ((x * LEVELS as f64) as usize).min(LEVELS - 1);

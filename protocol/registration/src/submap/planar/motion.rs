@@ -1,6 +1,6 @@
-//! Wheels slip and skid; the laser sees by how much. Each keyframe's scan is fitted to the walls of the keyframes before
-//! it, with the odometry as a prior: the maximum a posteriori of both. Along a bare corridor the odometry stays as it
-//! is, and the covariance says so.
+//! Wheels slip and skid; the laser sees by how much. Each keyframe's scan is fitted to the walls of the keyframes
+//! before it, with the odometry as a prior: the maximum a posteriori of both. Along a bare corridor the odometry stays
+//! as it is, and the covariance says so.
 
 use super::OUT_OF_PLANE_DRIVEN;
 use super::fit::{Walls, system};
@@ -24,8 +24,8 @@ const STEP: f64 = 0.01;
 const FACING: f64 = 0.1;
 /// Pairs without which the odometry stays as it is.
 const PAIRS_MIN: usize = 20;
-/// Independent measurements that the pairs of one scan amount to: they lie on a few walls, and the walls were themselves
-/// drawn from scans.
+/// Independent measurements that the pairs of one scan amount to: they lie on a few walls, and the walls were
+/// themselves drawn from scans.
 const INDEPENDENT_MAX: f64 = 20.0;
 /// Least standard deviation of a sharpened motion: voxels...
 const FLOOR: f64 = 0.1;
@@ -92,7 +92,8 @@ impl Sharpener {
         scan: &[Vector2<f64>],
     ) -> Option<(Se2, Matrix3<f64>)> {
         let near = self.walls(last).near();
-        // A single scan's far points lie too sparse for lines of their own: all that is known is that they face the sensor.
+        // A single scan's far points lie too sparse for lines of their own: all that is known is that they face the
+        // sensor.
         let normals = scan.iter().map(|p| (-p).try_normalize(1e-9).unwrap_or_else(Vector2::x)).collect();
         let walls = Walls { points: scan.to_vec(), normals };
         let information = prior.try_inverse()?;

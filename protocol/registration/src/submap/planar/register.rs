@@ -1,4 +1,5 @@
-//! From a peer's planar keypoints to an alignment or a refusal: all poses on a raster, the best judged, the winner fitted.
+//! From a peer's planar keypoints to an alignment or a refusal: all poses on a raster, the best judged, the winner
+//! fitted.
 
 use super::super::block::{Stored, Surfel};
 use super::super::descriptor::PACKED_LEN;
@@ -25,8 +26,8 @@ const RADIUS: f64 = 2.0;
 /// Independent measurements that the pairs of fully overlapping submaps amount to: what bends a submap does not average
 /// out over its points.
 const INDEPENDENT_MAX: f64 = 8.0;
-/// A pair informs about a direction only if its (scaled) Jacobian leans at least this far that way: noise of the normals
-/// feigns information along a corridor.
+/// A pair informs about a direction only if its (scaled) Jacobian leans at least this far that way: noise of the
+/// normals feigns information along a corridor.
 const LEAN_MIN: f64 = 0.25;
 /// Least standard deviation: voxels...
 const FLOOR: f64 = 0.3;

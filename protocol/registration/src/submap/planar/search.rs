@@ -1,7 +1,7 @@
 //! All poses of their keypoints on my chart, from coarse to fine. Rotations are those under which the two histograms of
-//! wall directions agree (Censi's Hough scan matching, 2005); for each of them every translation has a bound of how many
-//! keypoints can lie on my walls ([`Codec::reachable`], as in Olson 2009), and the most promising are looked at cell by
-//! cell.
+//! wall directions agree (Censi's Hough scan matching, 2005); for each of them every translation has a bound of how
+//! many keypoints can lie on my walls ([`Codec::reachable`], as in Olson 2009), and the most promising are looked at
+//! cell by cell.
 
 use super::codec::{Codec, EDGE, FREE, sector};
 use super::fit::Walls;

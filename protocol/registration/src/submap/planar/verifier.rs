@@ -1,6 +1,7 @@
-//! What my submap says of poses: how many of their keypoints lie on my walls, how surprising that is, and how many would
-//! stand where my beams passed. As in space ([`register`](super::super::register)): a keypoint that every other pose of
-//! this pair confirms, too, such as one on the long wall of a corridor, weighs nothing; a door frame weighs much.
+//! What my submap says of poses: how many of their keypoints lie on my walls, how surprising that is, and how many
+//! would stand where my beams passed. As in space ([`register`](super::super::register)): a keypoint that every other
+//! pose of this pair confirms, too, such as one on the long wall of a corridor, weighs nothing; a door frame weighs
+//! much.
 
 use super::super::near::Near;
 use super::codec::Codec;
