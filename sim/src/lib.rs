@@ -5,6 +5,23 @@
 //! A run is a pure function of a [`scenario::Scenario`] and a seed: the same pair gives the same trace hash, bit for
 //! bit. First a storm (robots drive, faults rage), then calm: the network heals and the swarm must converge in a stated
 //! time.
+//!
+//! ```text
+//!  scenario, seed ─► world, drives ─► queue of virtual time ◄─► cores, disks, links, faults
+//!                                        │
+//!                          checks of every invariant ─► outcome, report, trace hash
+//! ```
+//!
+//! ```no_run
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! use merganser_sim::{report::Report, scenario::Scenario, swarm::Swarm};
+//!
+//! let scenario = Scenario::parse(&std::fs::read_to_string("sim/scenarios/three.toml")?)?;
+//! let swarm = Swarm::<merganser_protocol::agent::Agent>::new(scenario, 1)?;
+//! let outcome = swarm.run(|_| {})?;
+//! println!("{:?}, trace {}", outcome.violation, Report::of(&outcome).trace);
+//! # Ok(()) }
+//! ```
 
 pub mod band;
 pub mod bar;
