@@ -123,7 +123,7 @@ impl Host {
         let (driver, snapshots) = Driver::new(Parts { core, network, store, journal, outbox, inbox: own, clock, jobs });
         let (stop, stopped) = oneshot::channel();
         let driver = tokio::spawn(driver.run(async {
-            let _ = stopped.await; // gone without a word is a word too
+            let _ = stopped.await; // A dropped sender ends the agent as a sent one does.
         }));
         let link = opened.start(snapshots.clone()).await?;
         info!(robot = %config.robot, swarm = %config.swarm, listen = ?config.zenoh.listen, "agent runs");

@@ -6,19 +6,19 @@
 use super::track::Track;
 use super::trajectory::{self, Corrected, TrajectoryError};
 use super::views::{Views, relative};
-use merganser_protocol::geometry::{Relative, Sim3};
+use merganser_protocol::geometry::{Relative, Sim3, chi2};
 use merganser_protocol::snapshot::PairStatus;
 use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::SVector;
 
 /// χ²₆ at 95 %: one honest error in twenty lies outside.
-pub const CHI2_6_95: f64 = 12.591_587_243_743_977;
+pub const CHI2_6_95: f64 = chi2::P95[5];
 /// χ²₆ at 99.9 %: an error outside is no accident.
-pub const CHI2_6_999: f64 = 22.457_744_484_825_33;
+pub const CHI2_6_999: f64 = chi2::P999[5];
 /// χ²₇ at 95 %, for similarities...
-pub const CHI2_7_95: f64 = 14.067_140_449_340_169;
+pub const CHI2_7_95: f64 = chi2::P95[6];
 /// ...and at 99.9 %.
-const CHI2_7_999: f64 = 24.321_886_347_856_854;
+const CHI2_7_999: f64 = chi2::P999[6];
 /// How far off a scale may be, share.
 const SCALE_OFF_MAX: f64 = 0.05;
 /// Units this close are one unit, share.

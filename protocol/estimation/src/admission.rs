@@ -9,10 +9,9 @@ use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
 use super::odometry_correlation::Around;
 use super::position::{DIMENSION, StatedPoint};
-use super::reweight::CHI2_999;
 use super::solve::SolveError;
 use super::trajectory::Trajectory;
-use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative, So3};
+use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative, So3, chi2};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::kinds::PairStatus;
 use crate::kinds::ScaleKind;
@@ -285,7 +284,7 @@ impl EdgeEstimate {
 
     /// Whether an honest measurement would be so far off at most 999 times in 1,000.
     fn is_consistent(&self, d: &Disagreement) -> bool {
-        if self.point.is_some() { d.distance_squared <= CHI2_999[DIMENSION - 1] } else { d.is_consistent() }
+        if self.point.is_some() { d.distance_squared <= chi2::P999[DIMENSION - 1] } else { d.is_consistent() }
     }
 
     /// The factor that its pair found its standard deviations to need.

@@ -33,7 +33,7 @@ pub mod world;
 
 use super::trajectory::Trajectory;
 use crate::config::EstimateConfig;
-use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
+use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance, chi2};
 use measured::Measured;
 pub(super) use measured::scales_to;
 pub(super) use promising::promising;
@@ -195,10 +195,7 @@ impl<G, const N: usize> FrameOutcome<(G, Covariance<N>)> {
     }
 }
 
-/// χ² quantiles at 99.9 % for 6 and 7 degrees of freedom: two true alignments are seldom further apart.
-const CHI2_PAIR: [f64; 2] = [22.457_744_484_825_323, 24.321_886_347_856_854];
-
-/// Gate on d² of a pair at a covariance scale.
+/// Gate on d² of a pair at a covariance scale: two true alignments are seldom further apart.
 fn gate(dimension: usize, scale: f64) -> f64 {
-    CHI2_PAIR[usize::from(dimension == 7)] * scale * scale
+    chi2::P999[5 + usize::from(dimension == 7)] * scale * scale
 }

@@ -1,4 +1,25 @@
 //! From the set of facts to the map: frame-level consensus, factor graph, joint estimate and its covariances.
+//!
+//! ```text
+//!  chains of submaps, alignments, sightings ─► admission ─► consensus of each pair of frames ─► graph
+//!                                                                                                │
+//!  covariances, live poses, certificate ◄─ joint estimate ◄─ drop what contradicts the rest ◄─ solve
+//! ```
+//!
+//! ```
+//! use merganser_estimation::posegraph::{g2o::Parser, solve::Start};
+//!
+//! let mut parser = Parser::default();
+//! for line in ["VERTEX_SE2 0 0 0 0", "VERTEX_SE2 1 1 0 0", "EDGE_SE2 0 1 1.1 0 0 100 0 0 100 0 400"] {
+//!     parser.line(line)?;
+//! }
+//! let graph = parser.finish();
+//! let start = graph.start(Start::Relaxed, 100)?;
+//! let solved = graph.solve(&start, 100)?;
+//! assert!((solved.values[1].translation.x - 1.1).abs() < 1e-6);
+//! println!("as sure as {:?}", solved.marginals()[1].1.sigmas());
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod admission;
 pub mod certificate;

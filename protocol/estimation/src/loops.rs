@@ -8,9 +8,8 @@
 use super::admission::{Admission, Kind};
 use super::joint::Unused;
 use super::relative_odometry::{OdometryStep, RelativeOdometry, compose, inverse};
-use super::reweight::CHI2_999;
 use super::trajectory::Trajectory;
-use crate::geometry::{Covariance, PoseWithCovariance, Se3};
+use crate::geometry::{Covariance, PoseWithCovariance, Se3, chi2};
 use crate::ids::FrameId;
 use std::collections::BTreeMap;
 
@@ -85,7 +84,7 @@ pub(super) fn gate(admission: &mut Admission) -> BTreeMap<FrameId, Loops> {
         closures.retain(|c| {
             let odometry = chain.trajectory.relative(c.i, c.j);
             let distance = odometry.as_ref().map_or(f64::INFINITY, |t| t.distance_squared(&c.t_i_j));
-            let good = distance <= CHI2_999[5];
+            let good = distance <= chi2::P999[5];
             if !good {
                 refused.push((c.edge, Unused::Odometry(distance)));
                 refuted += usize::from(is_metric && odometry.is_some_and(|t| c.is_elsewhere(&t.pose, &driven)));
@@ -157,7 +156,7 @@ impl<'a> Around<'a> {
             let along = (other.t_i_j.pose, *other.t_i_j.covariance.matrix());
             let (pose, sigma) = compose(&compose(out, &along), &inverse(back));
             let through_other = PoseWithCovariance { pose, covariance: Covariance::new_or_wider(sigma) };
-            through_other.distance_squared(&self.closure.t_i_j) <= CHI2_999[5]
+            through_other.distance_squared(&self.closure.t_i_j) <= chi2::P999[5]
         })
     }
 }

@@ -10,9 +10,8 @@ use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_fra
 use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
 use super::loops::{self, Loops};
 use super::marginals::is_rigid;
-use super::reweight::CHI2_9999;
 use crate::config::EstimateConfig;
-use crate::geometry::{Disagreement, Relative, Sim3};
+use crate::geometry::{Disagreement, Relative, Sim3, chi2};
 use crate::ids::{FrameId, SubmapId};
 use crate::kinds::PairStatus;
 use std::collections::{BTreeMap, BTreeSet};
@@ -21,9 +20,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// cost the cube of their number; the others wait for the map, which tells the good ones better than a pair could.
 const WEIGHED_MAX: usize = 32;
 
-/// With so many pairs of submaps ambiguous for each alignment that is used, the frames are. Measured in simulated
-/// halls: where every shelf is the same, false merges had 1 to 2.3; elsewhere LiDARs have up to 0.2 and landmarks up to
-/// 0.7.
+/// A pair of frames is ambiguous from this ratio on: pairs of submaps that fit in several ways, over alignments that are
+/// used. Measured in simulated halls: false merges, where every shelf is the same, had 1 to 2.3; true ones have up to 0.2
+/// with LiDARs and up to 0.7 with landmarks.
 const AMBIGUOUS_SHARE: f64 = 0.8;
 
 /// Loop closures of one frame that its odometry refutes, or that fit at another place as well, from which on they tell
@@ -249,7 +248,7 @@ fn span(admission: &mut Admission, pairs: &mut [Pair]) {
 }
 
 fn agree(d: &Disagreement) -> bool {
-    d.distance_squared <= CHI2_9999[usize::from(d.degrees_of_freedom == 7)]
+    d.distance_squared <= chi2::P9999[5 + usize::from(d.degrees_of_freedom == 7)]
 }
 
 /// The spanning forest of merged frames.

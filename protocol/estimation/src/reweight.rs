@@ -8,24 +8,11 @@
 use super::graph::{Edge, Label};
 use super::solve::Solution;
 use super::sparse::SelectedInverse;
+use crate::geometry::chi2;
 use crate::geometry::sim3::{self, Matrix7, Vector7};
 use crate::geometry::{Relative, se3};
 use libm::log;
 use nalgebra::SMatrix;
-
-/// χ² quantiles at 99.9 %, 1 to 7 degrees of freedom.
-pub(super) const CHI2_999: [f64; 7] = [
-    10.827_566_170_662_733,
-    13.815_510_557_964_274,
-    16.266_236_196_238_13,
-    18.466_826_952_903_17,
-    20.515_005_652_432_873,
-    22.457_744_484_825_323,
-    24.321_886_347_856_854,
-];
-
-/// χ² quantiles at 99.99 %, 6 and 7 degrees of freedom.
-pub(super) const CHI2_9999: [f64; 2] = [27.856_341_235_954_06, 29.877_503_907_893_756];
 
 /// Share of a measurement's variance that the rest of the map must be able to predict before it is tested.
 const REDUNDANCY_MIN: f64 = 1e-4;
@@ -49,7 +36,7 @@ pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
     let failing = tested.filter_map(|edge| {
         let LeftOut { chi2, dof, .. } = leave_one_out(solution, &inverse, edge)?;
         // A position says nothing of how what it saw is turned.
-        let limit = CHI2_999.get(dof.min(edge.dimension()).checked_sub(1)?)?;
+        let limit = chi2::P999.get(dof.min(edge.dimension()).checked_sub(1)?)?;
         (chi2 > *limit).then_some((chi2 / limit, Drop { label: edge.label, chi2 }))
     });
     let mut failing: Vec<(f64, Drop)> = failing.collect();
@@ -118,18 +105,6 @@ fn deletion<const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use statrs::distribution::{ChiSquared, ContinuousCDF};
-
-    #[test]
-    fn quantiles_are_those_of_chi_squared() {
-        let tail = |dof: usize, x: f64| ChiSquared::new(dof as f64).unwrap().sf(x);
-        for (k, &x) in CHI2_999.iter().enumerate() {
-            assert!((tail(k + 1, x) / 1e-3 - 1.0).abs() < 1e-9, "{k}: {}", tail(k + 1, x));
-        }
-        for (k, &x) in CHI2_9999.iter().enumerate() {
-            assert!((tail(k + 6, x) / 1e-4 - 1.0).abs() < 1e-9, "{k}: {}", tail(k + 6, x));
-        }
-    }
 
     #[test]
     fn a_source_without_redundancy_is_not_tested() {

@@ -2,11 +2,7 @@
 //! other's keypoints. Of two submaps of one robot, which no other robot looks at, the robot itself looks both ways: a
 //! place that is taken for another from one side seldom is from the other.
 
-use crate::geometry::{Covariance, PoseWithCovariance, Relative, SimWithCovariance};
-
-/// χ² 99.9 % quantiles for 6 and 7 degrees of freedom: two independent alignments of one pair agree below these.
-const CHI2_6_999: f64 = 22.457_744_484_825_32;
-const CHI2_7_999: f64 = 24.321_886_347_856_85;
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, SimWithCovariance, chi2};
 
 /// Whether two independent measurements of one relative pose agree: d² of their difference under the sum of their
 /// covariances, χ² at 99.9 %.
@@ -14,11 +10,11 @@ pub fn agree(a: &Relative, b: &Relative) -> bool {
     match (a, b) {
         (Relative::Metric(a), Relative::Metric(b)) => {
             let sum = a.covariance.plus(&b.covariance);
-            sum.mahalanobis_squared(&a.pose.local(&b.pose)) <= CHI2_6_999
+            sum.mahalanobis_squared(&a.pose.local(&b.pose)) <= chi2::P999[5]
         }
         (Relative::Similarity(a), Relative::Similarity(b)) => {
             let sum = a.covariance.plus(&b.covariance);
-            sum.mahalanobis_squared(&a.sim.local(&b.sim)) <= CHI2_7_999
+            sum.mahalanobis_squared(&a.sim.local(&b.sim)) <= chi2::P999[6]
         }
         _ => false,
     }

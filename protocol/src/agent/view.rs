@@ -58,7 +58,7 @@ impl Agent {
 
     /// Work that this robot still has to do with the facts it holds.
     fn pending(&self) -> u64 {
-        // What nobody would take is not to be done.
+        // A robot at its epoch limit writes no facts that others would accept, so verdicts and proposals do not count.
         let open = if self.epoch_limit().is_some() { 0 } else { self.answers_owed().len() + self.proposals() };
         self.unsaved() + (self.negotiation.running.len() + open) as u64
     }

@@ -33,6 +33,7 @@ pub mod planar;
 pub mod refine;
 mod refusal;
 pub mod register;
+mod robust;
 pub mod runs;
 mod sampling;
 mod scene;

@@ -19,6 +19,7 @@ use super::block::Surfel;
 use super::cloud::Index;
 use super::features::{Features, Keypoints};
 use super::modality::Modality;
+use super::robust::cauchy_weight;
 use super::visibility::contradiction;
 use crate::config::Sensor;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, So3};
@@ -57,8 +58,6 @@ const SIGMA_MIN_VOXELS: f64 = 0.01;
 const ANCHOR_SIGMA_VOXELS: f64 = 1.0;
 /// So many matched points hold a direction that the surfaces leave free.
 const ANCHORS_MIN: usize = 4;
-/// Tuning constant of the Cauchy weight: 95 % efficiency under Gaussian noise.
-const CAUCHY: f64 = 2.385;
 
 /// When a refinement is refused.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -287,8 +286,7 @@ impl System {
         let mut rows: Vec<Row> = pairs.iter().map(|p| row(&p.their_point, &p.my_point, &p.my_normal)).collect();
         let sigma = robust_scale(&rows).max(SIGMA_MIN_VOXELS * voxel);
         for row in &mut rows {
-            let x = row.residual / (CAUCHY * sigma);
-            row.weight = 1.0 / (1.0 + x * x);
+            row.weight = cauchy_weight(row.residual, sigma);
         }
         let held = (sigma / (ANCHOR_SIGMA_VOXELS * voxel)) * (sigma / (ANCHOR_SIGMA_VOXELS * voxel));
         for ((their_point, my_point), axis) in anchors.iter().flat_map(|anchor| AXES.map(|axis| (anchor, axis))) {

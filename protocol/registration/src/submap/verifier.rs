@@ -3,6 +3,7 @@
 //! Lengths are in voxels.
 
 use super::matching::Pairing;
+use super::robust::cauchy_weight;
 use super::scene::{Cloud, NEAR, Pose, Scene, Verdict};
 use super::surface::least_axis;
 use crate::geometry::So3;
@@ -55,7 +56,7 @@ const POINTS_PER_MEASUREMENT: f64 = 3.0;
 /// What a keypoint with a match that agrees with the pose adds: under a wrong pose one in a hundred has one, under a
 /// right one at least one in twenty.
 const SUPPORT_GAIN: f64 = 3.0;
-/// What it takes at first coarse_score, in confirmed points.
+/// The coarse score that a pose needs, in confirmed points.
 const GLANCE_COST: f64 = 2.0;
 /// Poses that differ by more than this distance (voxels) or angle (rad) rival each other.
 const RIVAL: (f64, f64) = (4.0, 0.15);
@@ -137,7 +138,7 @@ impl<'a> PoseVerifier<'a> {
         promising.map(|pose| self.look(&pose, matches)).collect()
     }
 
-    /// The poses that look best at first coarse_score, polished a little, best first.
+    /// The poses of the best coarse scores, polished a little, best first.
     fn promising(&self, poses: &[Pose]) -> Vec<Pose> {
         let mut coarse: Vec<(f64, usize)> =
             (0..poses.len()).map(|k| (self.coarse_score(&poses[k], 0..COARSE), k)).collect();
@@ -162,7 +163,7 @@ impl<'a> PoseVerifier<'a> {
         self.close_look(self.polish(*pose, self.theirs.points.len(), &RADII), matches)
     }
 
-    /// The first [`POLISHED_MAX`] of those coarse at, but of poses near one of them only [`ALIKE_MAX`]: the rest of a
+    /// The first [`POLISHED_MAX`] of those with a coarse score, but of poses near one of them only [`ALIKE_MAX`]: the rest of a
     /// good one's neighbourhood must not crowd out its rivals.
     fn varied(&self, poses: &[Pose], coarse: &[(f64, usize)]) -> Vec<usize> {
         let mut chosen: Vec<usize> = Vec::new();
@@ -319,7 +320,6 @@ fn often<'a>(count: usize, poses: impl Iterator<Item = &'a Vec<bool>>) -> Vec<u3
 fn plane_step(rows: &[(Vector3<f64>, Vector3<f64>, f64)]) -> Option<Pose> {
     const ROWS_MIN: usize = 12;
     const SIGMA_MIN: f64 = 0.05;
-    const CAUCHY: f64 = 2.385;
     const LEVER: f64 = 10.0;
     if rows.len() < ROWS_MIN {
         return None;
@@ -332,8 +332,7 @@ fn plane_step(rows: &[(Vector3<f64>, Vector3<f64>, f64)]) -> Option<Pose> {
     for (at, n, e) in rows {
         let turn = (at - centre).cross(n) / LEVER;
         let j = Vector6::new(n.x, n.y, n.z, turn.x, turn.y, turn.z);
-        let x = e / (CAUCHY * sigma);
-        let w = 1.0 / (1.0 + x * x);
+        let w = cauchy_weight(*e, sigma);
         h += j * j.transpose() * w;
         g += j * (w * e);
     }

@@ -9,7 +9,7 @@
 use super::world::{Part, World};
 use crate::frames::clique::{self, Set, bit};
 use crate::frames::scales_to;
-use crate::geometry::{PoseWithCovariance, Relative, Se3};
+use crate::geometry::{PoseWithCovariance, Relative, Se3, chi2};
 use crate::graph::Disjoint;
 use crate::ids::SubmapId;
 use core::f64::consts::PI;
@@ -19,7 +19,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Closures between two parts that are compared, at most; of more, evenly from first to last.
 const COMPARED_MAX: usize = 64;
 /// χ²₆ at 99.9 %.
-const GATE: f64 = 22.457_744_484_825_323;
+const GATE: f64 = chi2::P999[5];
 /// A second set with this share of the first one's members leaves the answer open.
 const RIVAL_SHARE: f64 = 0.8;
 

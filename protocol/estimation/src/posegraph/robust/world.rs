@@ -9,7 +9,7 @@ use super::noise::{Noise, Tally};
 use super::scale::{self, Innovation, Scale};
 use crate::Unused;
 use crate::config::EstimateConfig;
-use crate::geometry::{Relative, Se3, Sim3};
+use crate::geometry::{Relative, Se3, Sim3, chi2};
 use crate::graph::{Disjoint, Factor, Graph, Label};
 use crate::ids::{EntryId, FrameId, SubmapId};
 use crate::reweight::leave_one_out;
@@ -18,10 +18,9 @@ use core::f64::consts::PI;
 use nalgebra::{Matrix6, Vector3};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// χ² exceeds these once in a million times, 1 to 6 degrees of freedom. So seldom, because the noise itself is
+/// χ² exceeds these once in a million times. So seldom, because the noise itself is
 /// estimated and its tails are longer than Gaussian, and false closures seldom come so near.
-pub(super) const CHI2_MAX: [f64; 6] =
-    [23.9281269769348, 27.6310211159285, 30.6648497062136, 33.3768415817198, 35.8881868796729, 38.2583363772097];
+const CHI2_MAX: [f64; 7] = chi2::P999999;
 
 /// ln of how much likelier than by chance a closure must be there to be let in by itself.
 const LOG_ODDS_MIN: f64 = 2.3;
@@ -31,8 +30,6 @@ const TRIALS_MAX: usize = 24;
 const FALSE_ALARMS_MAX: f64 = 0.01;
 /// Of times [`CHI2_MAX`] beyond which nothing is asked of a closure.
 const FAR: f64 = 4.0;
-/// χ²₆ at 99.99 %.
-const CHI2_9999: f64 = 27.856_341_235_954_06;
 /// Least edge of the box in which a false closure may fall, m.
 const SEARCH_EDGE_MIN: f64 = 2.0;
 /// A closure dropped so often stays out.
@@ -312,7 +309,7 @@ impl World<'_> {
     /// as noise of one of the scales, but not where true ones are seldom, nor short of where most of them are.
     fn limit(&self, part: &Part, log_sqrt_det: f64) -> f64 {
         let odds = |chi2: f64| scale::log_ratio_over((chi2, log_sqrt_det), part.volume, &self.scales);
-        let (mut low, mut high) = (CHI2_9999, CHI2_MAX[5]);
+        let (mut low, mut high) = (chi2::P9999[5], CHI2_MAX[5]);
         if odds(high) >= 0.0 {
             return high;
         }

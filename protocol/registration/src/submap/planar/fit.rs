@@ -2,14 +2,13 @@
 //! nearest point that faces the same way, with Cauchy weights at the noise scale that the residuals show.
 
 use super::super::near::{Near, Piece};
+use super::super::robust::cauchy_weight;
 use super::lines::piece;
 use super::se2::Se2;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 /// Least noise scale: a thinned wall is no sharper.
 const SIGMA_MIN: f64 = 0.1;
-/// Tuning constant of the Cauchy weight: 95 % efficiency under Gaussian noise.
-const CAUCHY: f64 = 2.385;
 
 /// Oriented points.
 #[derive(Clone, Debug, Default)]
@@ -89,8 +88,7 @@ pub fn system(walls: &Walls, near: &Near, pose: &Se2, radius: f64, cos_min: f64)
     };
     let (mut h, mut g) = (Matrix3::zeros(), Vector3::zeros());
     for (j, e) in &mut rows {
-        let x = *e / (CAUCHY * sigma);
-        let w = 1.0 / (1.0 + x * x);
+        let w = cauchy_weight(*e, sigma);
         h += *j * j.transpose() * w;
         g += *j * (w * *e);
         *e = w;
