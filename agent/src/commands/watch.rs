@@ -260,6 +260,10 @@ fn draw(swarm: &Name, robots: &BTreeMap<Name, Seen>) -> String {
     }
     let mut text = format!("swarm {swarm}\n");
     lay_out(&mut text, &rows);
+    let statuses = robots.values().filter_map(|seen| Some(&seen.status.as_ref()?.1));
+    if let Some(warning) = estimates_differ(statuses) {
+        let _ = writeln!(text, "{}", style(warning).yellow()); // a String takes any text
+    }
     let mut pairs = BTreeMap::new();
     for pair in robots.values().flat_map(|seen| &seen.pairs) {
         let before = pairs.entry((&pair.a, &pair.b)).or_insert(pair);
@@ -275,6 +279,23 @@ fn draw(swarm: &Name, robots: &BTreeMap<Name, Seen>) -> String {
         lay_out(&mut text, &rows);
     }
     text
+}
+
+/// Who makes which map of equal facts, if not all make the same.
+fn estimates_differ<'a>(statuses: impl Iterator<Item = &'a StatusView>) -> Option<String> {
+    let mut by_estimate: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for status in statuses {
+        let estimate = if status.estimate.is_empty() { "an older agent" } else { &status.estimate };
+        by_estimate.entry(estimate).or_default().push(&status.robot);
+    }
+    let groups: Vec<String> =
+        by_estimate.iter().map(|(estimate, robots)| format!("{} ({estimate})", robots.join(" "))).collect();
+    (groups.len() > 1).then(|| {
+        format!(
+            "maps differ although facts are equal: {}; give all robots one version and the same [core.estimate]",
+            groups.join(", ")
+        )
+    })
 }
 
 fn pair_row(pair: &PairView) -> Vec<String> {
@@ -312,5 +333,30 @@ fn lay_out(text: &mut String, rows: &[Vec<String>]) {
         let line = cells.join("  ");
         let line = line.trim_end();
         let _ = if number == 0 { writeln!(text, "{}", style(line).dim()) } else { writeln!(text, "{line}") }; // a String takes any text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn status(robot: &str, estimate: &str) -> StatusView {
+        let view = json!({
+            "swarm": "s", "robot": robot, "id": "", "epoch": 0, "neighbours": [], "entries": 0, "digest": "", "submaps": 0,
+            "keyframes": 0, "pending": 0, "unsaved": 0, "idle": true, "merged_with": [], "receive_only": false,
+            "estimate": estimate,
+        });
+        serde_json::from_value(view).unwrap()
+    }
+
+    #[test]
+    fn robots_that_estimate_otherwise_are_named() {
+        let told = |robots: &[StatusView]| estimates_differ(robots.iter());
+        let (a, b) = (status("alpha", "1-aa"), status("beta", "1-aa"));
+        assert_eq!(told(&[]), None);
+        assert_eq!(told(&[a.clone(), b.clone()]), None);
+        let text = told(&[a.clone(), b, status("gamma", "1-bb")]).unwrap();
+        assert!(text.contains("alpha beta (1-aa), gamma (1-bb)") && text.contains("[core.estimate]"), "{text}");
+        assert!(told(&[a, status("old", "")]).unwrap().contains("old (an older agent)"));
     }
 }

@@ -101,6 +101,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
             neighbours: others(own),
             entries: 30,
             digest: "abcd".into(),
+            estimate: String::new(),
             submaps: 3,
             keyframes: KEYFRAMES as u64,
             pending: 0,

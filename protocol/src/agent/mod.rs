@@ -12,6 +12,7 @@ mod beacons;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
+pub mod estimate_version;
 mod gossip;
 pub mod io;
 pub mod job;

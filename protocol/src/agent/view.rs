@@ -46,6 +46,7 @@ impl Agent {
             neighbours: self.gossip.spread.neighbours().map(|robot| self.robot_name(robot)).collect(),
             entries: self.replica.held(),
             digest: self.replica.digest().to_string(),
+            estimate: super::estimate_version::fingerprint(&self.config.estimate),
             submaps: self.negotiation.own().count() as u64,
             keyframes: self.mapper.keyframes,
             pending,

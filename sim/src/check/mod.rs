@@ -198,6 +198,7 @@ pub(crate) mod tests {
             neighbours: Vec::new(),
             entries: 3,
             digest: digest.to_string(),
+            estimate: String::new(),
             submaps: 1,
             keyframes: 1,
             pending: 0,
