@@ -65,8 +65,8 @@ pub struct StatusView {
     pub entries: u64,
     /// BLAKE3 digest of the set of entries, hexadecimal.
     pub digest: String,
-    /// How it makes a map of its facts: version and options ([`crate::agent::estimate_version`]). Robots that differ in it
-    /// hold different maps of equal facts. Empty of an older agent.
+    /// How it makes a map of its facts: version and options ([`crate::agent::estimate_version`]). Robots that differ in
+    /// it hold different maps of equal facts. Empty of an older agent.
     #[serde(default)]
     pub estimate: String,
     /// Own submaps finished.

@@ -21,8 +21,8 @@
 //! Odometry that drifts bends the cloud, too: its middle lies off its anchor, the middle keyframe, by about a twelfth
 //! of the variance of the walk while it was made (`walk`). So much is added to `C_k`. *Measured* in swarms of stand-in
 //! clouds that drift so (`merganser-sim bench calibration`): without it the submaps' NEES is 1.18 by degrees of
-//! freedom. What goes with the odometry on either side is told to the graph by `bend`, and to who goes on from the map
-//! by [`ends`](super::extrapolation).
+//! freedom. What goes with the odometry on either side is told to the graph by `odometry_correlation`, and to who goes
+//! on from the map by [`ends`](super::extrapolation).
 
 use super::admission::Kind;
 use super::graph::{Factor, Label};

@@ -7,12 +7,12 @@
 //! two errors the body has the difference. To sum their variances would make live poses look worse than they are.
 //!
 //! With `d` what the cloud's factor is off by (where the cloud lies by its anchor, but for what the steps of odometry
-//! to and from that tell of it: `bend`), of covariance Σ_d, and ν what the motion from the anchor is off by, both by
-//! local perturbations at the anchor, `X = Cov(d, ν)`. Of ν, `Xᵀ Σ_d⁻¹ d` is told by d and the rest by nothing in the
-//! map, so that the error δ of the anchor goes with ν by `Cov(δ, ν) = P Σ_d⁻¹ X`, with P the map's `Cov(δ, d)`. A
-//! random walk loses about half of its variance after the anchor, and the cloud follows what is lost there by about a
-//! quarter (`walk` knows it from how many keyframes there are). `X` is that share of what is lost there, or of the
-//! whole motion where that is less: a submap may be cut short.
+//! to and from that tell of it: `odometry_correlation`), of covariance Σ_d, and ν what the motion from the anchor is
+//! off by, both by local perturbations at the anchor, `X = Cov(d, ν)`. Of ν, `Xᵀ Σ_d⁻¹ d` is told by d and the rest by
+//! nothing in the map, so that the error δ of the anchor goes with ν by `Cov(δ, ν) = P Σ_d⁻¹ X`, with P the map's
+//! `Cov(δ, d)`. A random walk loses about half of its variance after the anchor, and the cloud follows what is lost
+//! there by about a quarter (`walk` knows it from how many keyframes there are). `X` is that share of what is lost
+//! there, or of the whole motion where that is less: a submap may be cut short.
 //!
 //! A frame begins as it ends: its origin is the first keyframe, which is one of those that made the first submap, and
 //! what the odometry lost from there to the first anchor bent the first cloud likewise. *Measured* in swarms of LiDARs

@@ -5,7 +5,6 @@
 //! (MATH §1: local perturbations), with the exact Jacobians of MATH §2: `∂r/∂δ_j = J_r⁻¹(r)`,
 //! `∂r/∂δ_i = −J_l⁻¹(r) Ad(t_i_j⁻¹)`. Gauge: the smallest [`SubmapId`] of a component is held fixed.
 
-use super::odometry_correlation::Bend;
 use crate::geometry::sim3::{self, Matrix7, Vector7};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, se3};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -92,6 +91,13 @@ pub enum GraphError {
     },
 }
 
+/// A cloud's factor that follows steps of odometry.
+#[derive(Clone, Debug)]
+pub(super) struct OdometryCorrelation {
+    /// The edges of the steps, and by how much of their residuals.
+    pub(super) steps: Vec<(usize, Matrix6<f64>)>,
+}
+
 /// One connected component, ready to be solved.
 #[derive(Clone, Debug)]
 pub struct Graph {
@@ -101,7 +107,7 @@ pub struct Graph {
     scale_count: usize,
     factors: Vec<Edge>,
     /// Of factors that follow others, by their place.
-    pub(super) bends: BTreeMap<usize, Bend>,
+    pub(super) correlations: BTreeMap<usize, OdometryCorrelation>,
 }
 
 /// A factor with its nodes resolved. A map has three of them to an anchor, so that no number is held twice.
@@ -180,7 +186,7 @@ impl Graph {
         let component = |(root, nodes): (usize, Vec<SubmapId>)| {
             let (scales, scale_count) = scale_variables(&nodes, unknown_scale);
             let factors = edges_of.remove(&root).unwrap_or_default();
-            Self { nodes, scales, scale_count, factors, bends: BTreeMap::new() }
+            Self { nodes, scales, scale_count, factors, correlations: BTreeMap::new() }
         };
         Ok(members.into_iter().map(component).collect())
     }

@@ -320,7 +320,7 @@ fn solve_components(admission: &Admission, start: &BTreeMap<SubmapId, Sim3>, ite
         let solution = match Graph::components(&nodes, &admission.unknown_scale, factors) {
             Ok(mut graphs) if graphs.len() == 1 => {
                 let mut graph = graphs.remove(0);
-                graph.bend(&gains);
+                graph.correlate(&gains);
                 let place = |id: &SubmapId| start.get(id).or_else(|| start.get(&distortion::anchor_of(*id))).copied();
                 let start = graph.nodes().iter().map(|id| place(id).unwrap_or_else(Sim3::identity));
                 let start = start.collect();

@@ -47,6 +47,7 @@ mod relative_odometry;
 pub mod residual;
 mod reweight;
 pub mod solve;
+mod solve_error;
 mod sparse;
 pub mod trajectory;
 

@@ -92,7 +92,7 @@ impl Solution {
             self.difference(edge.i, edge.j, &(self.values[edge.j].inverse() * self.values[edge.i]).adjoint())
         };
         let mut rows = of(cloud);
-        for (step, gain) in self.graph.bends.get(&place).into_iter().flat_map(|bend| &bend.steps) {
+        for (step, gain) in self.graph.correlations.get(&place).into_iter().flat_map(|correlation| &correlation.steps) {
             let mut follows = Matrix7::zeros();
             follows.fixed_view_mut::<6, 6>(0, 0).copy_from(&-gain);
             let followed =

@@ -4,7 +4,7 @@
 //! (Madsen, Nielsen and Tingleff 2004, §3.2) until a step keeps its promise. The elimination order and symbolic
 //! factorisation are made once.
 
-use super::solve::SolveError;
+use super::solve_error::SolveError;
 use super::sparse::{BlockPattern, Factor, Workspace, zeroed};
 
 /// Stop when a step promises to lower the cost by less than this share of (1 + cost), or when the next one would: of a

@@ -1,16 +1,16 @@
 //! What a cloud owes to the odometry on either side of its anchor. Of the error d of where the cloud lies by its
 //! anchor, a part is told by what the steps to and from the anchor are off by, which bent it
-//! ([`walk`](super::drift_model)): with `r_k` and `r_{k+1}` the residuals of these steps and Σ their covariances, the
-//! cloud's factor is that of `d − Cov(d, r_k) Σ_k⁻¹ r_k − Cov(d, r_{k+1}) Σ_{k+1}⁻¹ r_{k+1}`, of what is then left of
-//! d's covariance: a factor of four nodes. What neighbouring clouds still have in common, by the step between them, is
-//! left out.
+//! ([`drift_model`](super::drift_model)): with `r_k` and `r_{k+1}` the residuals of these steps and Σ their
+//! covariances, the cloud's factor is that of `d − Cov(d, r_k) Σ_k⁻¹ r_k − Cov(d, r_{k+1}) Σ_{k+1}⁻¹ r_{k+1}`, of what
+//! is then left of d's covariance: a factor of four nodes. What neighbouring clouds still have in common, by the step
+//! between them, is left out.
 //!
 //! *Worked out* for one axis of a chain of twelve submaps of four keyframes, each aligned one to four times with what
 //! is known, of 0.2, 1 and 4 times the walk's variance: anchors amid the chain have 1.02, 1.01 and 1.00 of the variance
 //! that they claim. Without it they have 1.27, 1.13 and 1.04, and 6, 2 and 1 % more than with it.
 
 use super::drift_model::{DriftModel, Stretch};
-use super::graph::{Edge, Graph, Label};
+use super::graph::{Edge, Graph, Label, OdometryCorrelation};
 use crate::geometry::{Covariance, PoseWithCovariance, Sim3};
 use crate::ids::SubmapId;
 use nalgebra::{Matrix6, Vector6};
@@ -66,28 +66,21 @@ impl Followed {
     }
 }
 
-/// A cloud's factor that follows steps of odometry.
-#[derive(Clone, Debug)]
-pub(super) struct Bend {
-    /// The edges of the steps, and by how much of their residuals.
-    pub(super) steps: Vec<(usize, Matrix6<f64>)>,
-}
-
 /// The residual of such a factor, and its Jacobians by the perturbations of its nodes, ascending.
-pub(super) struct Bent {
+pub(super) struct CorrelatedResidual {
     pub(super) residual: Vector6<f64>,
     pub(super) by: Vec<(usize, Matrix6<f64>)>,
 }
 
-impl Bend {
+impl OdometryCorrelation {
     fn residual(&self, graph: &Graph, cloud: &Edge, values: &[Sim3]) -> Vector6<f64> {
         let of = |edge: &Edge| edge.residual(values).fixed_rows::<6>(0).into_owned();
         let steps = self.steps.iter().map(|(step, gain)| gain * of(&graph.edges()[*step]));
         of(cloud) - steps.sum::<Vector6<f64>>()
     }
 
-    pub(super) fn linearise(&self, graph: &Graph, cloud: &Edge, values: &[Sim3]) -> Bent {
-        let mut bent = Bent { residual: Vector6::zeros(), by: Vec::with_capacity(4) };
+    pub(super) fn linearise(&self, graph: &Graph, cloud: &Edge, values: &[Sim3]) -> CorrelatedResidual {
+        let mut bent = CorrelatedResidual { residual: Vector6::zeros(), by: Vec::with_capacity(4) };
         bent.add(cloud, values, &Matrix6::identity());
         self.steps.iter().for_each(|(step, gain)| bent.add(&graph.edges()[*step], values, &-gain));
         bent.by.sort_by_key(|(node, _)| *node);
@@ -95,7 +88,7 @@ impl Bend {
     }
 }
 
-impl Bent {
+impl CorrelatedResidual {
     fn add(&mut self, edge: &Edge, values: &[Sim3], gain: &Matrix6<f64>) {
         let (residual, by_j, adjoint) = edge.linearise_rigid(values);
         self.residual += gain * residual;
@@ -111,10 +104,10 @@ impl Bent {
 
 impl Graph {
     /// Lets the clouds of these anchors, of frames without a scale variable, follow the steps to and from them.
-    pub(super) fn bend(&mut self, gains: &BTreeMap<SubmapId, Gains>) {
+    pub(super) fn correlate(&mut self, gains: &BTreeMap<SubmapId, Gains>) {
         let of = |label: Label| self.edges().iter().enumerate().filter(move |(_, edge)| edge.label == label);
         let steps: BTreeMap<(usize, usize), usize> = of(Label::Odometry).map(|(k, e)| ((e.i, e.j), k)).collect();
-        let bend = |(k, cloud): (usize, &Edge)| {
+        let correlation = |(k, cloud): (usize, &Edge)| {
             let gains = gains.get(&self.nodes()[cloud.i])?;
             let anchor = self.nodes()[cloud.i];
             let beside = |index: Option<u32>| self.position(SubmapId { index: index?, ..anchor });
@@ -123,17 +116,17 @@ impl Graph {
             let step =
                 |(ends, gain): (Option<(usize, usize)>, &Option<Matrix6<f64>>)| Some((*steps.get(&ends?)?, (*gain)?));
             let steps: Vec<_> = ends.into_iter().zip(gains).filter_map(step).collect();
-            (!steps.is_empty()).then_some((k, Bend { steps }))
+            (!steps.is_empty()).then_some((k, OdometryCorrelation { steps }))
         };
-        self.bends = of(Label::Cloud).filter_map(bend).collect();
+        self.correlations = of(Label::Cloud).filter_map(correlation).collect();
     }
 
     /// Weighted sum of squared residuals.
     pub(super) fn chi2(&self, values: &[Sim3]) -> f64 {
-        let one = |(k, edge): (usize, &Edge)| match self.bends.get(&k) {
+        let one = |(k, edge): (usize, &Edge)| match self.correlations.get(&k) {
             None => edge.chi2(values),
-            Some(bend) => {
-                let r = bend.residual(self, edge, values);
+            Some(correlation) => {
+                let r = correlation.residual(self, edge, values);
                 r.dot(&(edge.information_rigid() * r))
             }
         };
@@ -146,8 +139,8 @@ impl Graph {
     }
 
     /// The nodes of a factor that follows others.
-    pub(super) fn nodes_of(&self, bend: &Bend, cloud: &Edge) -> Vec<usize> {
-        let steps = bend.steps.iter().map(|(step, _)| &self.edges()[*step]);
+    pub(super) fn nodes_of(&self, correlation: &OdometryCorrelation, cloud: &Edge) -> Vec<usize> {
+        let steps = correlation.steps.iter().map(|(step, _)| &self.edges()[*step]);
         let mut nodes: Vec<usize> = steps.chain([cloud]).flat_map(|edge| [edge.i, edge.j]).collect();
         nodes.sort_unstable();
         nodes.dedup();

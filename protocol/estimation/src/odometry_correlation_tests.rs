@@ -36,7 +36,7 @@ fn chain(rng: &mut ChaCha8Rng) -> (Graph, Vec<Sim3>) {
     ];
     let nodes = BTreeSet::from([submap(0, 0), submap(0, 1), submap(0, 2), cloud]);
     let mut graph = Graph::components(&nodes, &BTreeSet::new(), factors).unwrap().remove(0);
-    graph.bend(&BTreeMap::from([(submap(0, 1), gains)]));
+    graph.correlate(&BTreeMap::from([(submap(0, 1), gains)]));
     let first = any_pose(rng, 5.0);
     let second = first * steps[0].pose;
     let near = |pose: Se3, rng: &mut ChaCha8Rng| Sim3::from_se3(&measured(rng, &pose, sigmas(0.1, 0.05)).pose);
@@ -44,9 +44,9 @@ fn chain(rng: &mut ChaCha8Rng) -> (Graph, Vec<Sim3>) {
     (graph, values.to_vec())
 }
 
-fn cloud_of(graph: &Graph) -> (&Edge, &Bend) {
+fn cloud_of(graph: &Graph) -> (&Edge, &OdometryCorrelation) {
     let (place, edge) = graph.cloud_of(MIDDLE as usize).unwrap();
-    (edge, &graph.bends[&place])
+    (edge, &graph.correlations[&place])
 }
 
 fn moved(values: &[Sim3], node: usize, direction: usize, by: f64) -> Vec<Sim3> {
@@ -61,14 +61,14 @@ fn moved(values: &[Sim3], node: usize, direction: usize, by: f64) -> Vec<Sim3> {
 fn jacobians_by_all_four_nodes_match_finite_differences() {
     for seed in 0..20 {
         let (graph, values) = chain(&mut rng(seed));
-        let (edge, bend) = cloud_of(&graph);
-        let exact = bend.linearise(&graph, edge, &values);
+        let (edge, correlation) = cloud_of(&graph);
+        let exact = correlation.linearise(&graph, edge, &values);
         assert_eq!(exact.by.iter().map(|(node, _)| *node).collect::<Vec<_>>(), [0, 1, 2, 3]);
-        assert_eq!(graph.nodes_of(bend, edge), [0, 1, 2, 3]);
-        assert!((exact.residual - bend.residual(&graph, edge, &values)).amax() < 1e-12);
+        assert_eq!(graph.nodes_of(correlation, edge), [0, 1, 2, 3]);
+        assert!((exact.residual - correlation.residual(&graph, edge, &values)).amax() < 1e-12);
         for (node, jacobian) in &exact.by {
             for k in 0..6 {
-                let at = |by| bend.residual(&graph, edge, &moved(&values, *node, k, by));
+                let at = |by| correlation.residual(&graph, edge, &moved(&values, *node, k, by));
                 let numeric: Vector6<f64> = (at(1e-6) - at(-1e-6)) / 2e-6;
                 let error = (numeric - jacobian.column(k)).amax();
                 assert!(error < 1e-6 * (1.0 + jacobian.amax()), "seed {seed} node {node} direction {k}: {error}");
@@ -94,7 +94,7 @@ fn the_solver_takes_the_factor_for_what_it_is() {
     let rows = |values: &[Sim3]| -> Vec<f64> {
         let one = |(k, edge): (usize, &Edge)| {
             let plain = edge.residual(values).fixed_rows::<6>(0).into_owned();
-            let r = graph.bends.get(&k).map_or(plain, |bend| bend.residual(graph, edge, values));
+            let r = graph.correlations.get(&k).map_or(plain, |correlation| correlation.residual(graph, edge, values));
             let whitened: Vector6<f64> = edge.information_rigid().cholesky().unwrap().l().transpose() * r;
             whitened.iter().copied().collect::<Vec<f64>>()
         };

@@ -22,7 +22,7 @@ impl Solution {
             return Optimality::Certified;
         }
         let edges: Option<Vec<ChordalEdge>> = self.graph.factors().map(|factor| self.isotropic(&factor)).collect();
-        let speaks = self.graph.scale_count() == 0 && self.graph.bends.is_empty();
+        let speaks = self.graph.scale_count() == 0 && self.graph.correlations.is_empty();
         let Some(edges) = edges.filter(|_| speaks) else { return Optimality::NotApplicable };
         let chordal = ChordalGraph { nodes: self.values.len(), edges };
         let start: Vec<_> = self.values.iter().map(Sim3::to_se3).collect();

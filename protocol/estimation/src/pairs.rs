@@ -20,9 +20,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// cost the cube of their number; the others wait for the map, which tells the good ones better than a pair could.
 const WEIGHED_MAX: usize = 32;
 
-/// A pair of frames is ambiguous from this ratio on: pairs of submaps that fit in several ways, over alignments that are
-/// used. Measured in simulated halls: false merges, where every shelf is the same, had 1 to 2.3; true ones have up to 0.2
-/// with LiDARs and up to 0.7 with landmarks.
+/// A pair of frames is ambiguous from this ratio on: pairs of submaps that fit in several ways, over alignments that
+/// are used. Measured in simulated halls: false merges, where every shelf is the same, had 1 to 2.3; true ones have up
+/// to 0.2 with LiDARs and up to 0.7 with landmarks.
 const AMBIGUOUS_SHARE: f64 = 0.8;
 
 /// Loop closures of one frame that its odometry refutes, or that fit at another place as well, from which on they tell

@@ -5,81 +5,14 @@
 
 use super::graph::{Edge, Graph};
 use super::minimise::{Minimum, Normal, Objective, minimise};
-use super::odometry_correlation::Bent;
+use super::odometry_correlation::CorrelatedResidual;
 use super::sparse::{BlockPattern, Factor, Slot};
 use crate::geometry::{Se3, Sim3, se3};
-use crate::ids::{FrameId, SubmapId};
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector6};
 use std::sync::Arc;
-use thiserror::Error;
 
+pub use super::solve_error::SolveError;
 pub use super::sparse::FACTOR_BYTES_MAX;
-
-/// Why a component could not be solved.
-#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
-pub enum SolveError {
-    /// The measurements leave a variable free, or are too ill-conditioned to tell.
-    #[error("variable {variable} of the component is not determined by its measurements")]
-    Underconstrained {
-        /// Variable in canonical order (anchors without the first, then scales).
-        variable: usize,
-    },
-    /// The measurements leave a submap's anchor free, or are too ill-conditioned to tell.
-    #[error("submap {0} is not determined by its measurements")]
-    UnderconstrainedAnchor(SubmapId),
-    /// The measurements leave a frame's unit free, or are too ill-conditioned to tell.
-    #[error("the scale of frame {0} is not determined by its measurements")]
-    UnderconstrainedScale(FrameId),
-    /// An intermediate number overflowed.
-    #[error("numbers overflowed; check the measurements' magnitudes")]
-    NotFinite,
-    /// The start has another number of poses than the component has anchors.
-    #[error("the start has {got} poses, the component {want} anchors")]
-    Start {
-        /// Anchors.
-        want: usize,
-        /// Poses given.
-        got: usize,
-    },
-    /// So much is tied to so much that the factorisation would outgrow its limit
-    /// ([`FACTOR_BYTES_MAX`]). Nothing was allocated.
-    #[error(
-        "too densely tied: the factorisation takes at least {} MiB, {} are allowed; leave out measurements between \
-         far parts, or solve the parts by themselves",
-        .bytes.div_ceil(1 << 20),
-        .limit >> 20
-    )]
-    TooDense {
-        /// Bytes that it takes at least.
-        bytes: u64,
-        /// Bytes that it may take.
-        limit: u64,
-    },
-    /// Memory for the factorisation could not be had.
-    #[error("not enough memory for the factorisation; free some, or solve fewer poses at a time")]
-    OutOfMemory,
-}
-
-impl SolveError {
-    /// The error with its submap named otherwise.
-    #[must_use]
-    pub fn renamed(self, name: impl Fn(SubmapId) -> SubmapId) -> Self {
-        match self {
-            Self::UnderconstrainedAnchor(id) => Self::UnderconstrainedAnchor(name(id)),
-            other => other,
-        }
-    }
-
-    /// The error of solving `graph`, with what its variable belongs to.
-    pub(super) fn of(self, graph: &Graph) -> Self {
-        let Self::Underconstrained { variable } = self else { return self };
-        let anchors = graph.nodes().len().saturating_sub(1);
-        let anchor = graph.nodes().get(variable + 1).map(|&id| Self::UnderconstrainedAnchor(id));
-        let has_scale = |k: &usize| variable >= anchors && graph.scale_of(*k) == Some(variable - anchors);
-        let scale = || (0..graph.nodes().len()).find(has_scale).map(|k| graph.nodes()[k].frame);
-        anchor.or_else(|| scale().map(Self::UnderconstrainedScale)).unwrap_or(self)
-    }
-}
 
 /// A solved component: estimates, and the factorisation from which covariances are drawn.
 #[derive(Clone, Debug)]
@@ -193,7 +126,7 @@ enum Terms {
     Rigid(Rigid),
     /// A cloud's that follows its odometry: first scalar of each node, none of the one held fixed, and the slots of the
     /// pairs (p, q), p ≤ q, of those that have one, row by row.
-    Bent { starts: Vec<Option<usize>>, slots: Vec<Slot> },
+    CorrelatedResidual { starts: Vec<Option<usize>>, slots: Vec<Slot> },
     /// All others: first scalar and part of each variable, and the slots of the pairs (p, q), p ≤ q, row by row.
     General { parts: Vec<(usize, Part)>, slots: Vec<Slot> },
 }
@@ -221,9 +154,12 @@ impl Terms {
     fn new(variables: Variables, pattern: &BlockPattern) -> Self {
         let slots = |variables: &Variables| variables.pairs().iter().map(|&(a, b)| pattern.slot(a, b)).collect();
         let parts = match &variables {
-            Variables::Bent(nodes) => {
+            Variables::CorrelatedResidual(nodes) => {
                 let start = |node: &usize| node.checked_sub(1).map(|variable| pattern.start(variable));
-                return Self::Bent { starts: nodes.iter().map(start).collect(), slots: slots(&variables) };
+                return Self::CorrelatedResidual {
+                    starts: nodes.iter().map(start).collect(),
+                    slots: slots(&variables),
+                };
             }
             Variables::Of(parts) => parts,
         };
@@ -260,9 +196,9 @@ impl Objective for System<'_> {
         for (k, (edge, terms)) in self.graph.edges().iter().zip(&self.terms).enumerate() {
             match terms {
                 Terms::Rigid(rigid) => add_rigid(edge, values, *rigid, normal),
-                Terms::Bent { starts, slots } => {
-                    if let Some(bend) = self.graph.bends.get(&k) {
-                        add_bent(&bend.linearise(self.graph, edge, values), edge, starts, slots, normal);
+                Terms::CorrelatedResidual { starts, slots } => {
+                    if let Some(correlation) = self.graph.correlations.get(&k) {
+                        add_bent(&correlation.linearise(self.graph, edge, values), edge, starts, slots, normal);
                     }
                 }
                 Terms::General { parts, slots } => add_general(edge, values, parts, slots, normal),
@@ -352,7 +288,7 @@ fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal:
     }
 }
 
-fn add_bent(bent: &Bent, edge: &Edge, starts: &[Option<usize>], slots: &[Slot], normal: &mut Normal) {
+fn add_bent(bent: &CorrelatedResidual, edge: &Edge, starts: &[Option<usize>], slots: &[Slot], normal: &mut Normal) {
     let information = edge.information_rigid();
     let weighted = information * bent.residual;
     let free: Vec<_> = bent.by.iter().zip(starts).filter_map(|((_, by), start)| Some((by, (*start)?))).collect();
@@ -402,15 +338,15 @@ pub(super) enum Variables {
     /// A factor of its two anchors and their scales.
     Of(Vec<(usize, Part)>),
     /// One that follows others: its nodes, ascending.
-    Bent(Vec<usize>),
+    CorrelatedResidual(Vec<usize>),
 }
 
 impl Variables {
     pub(super) fn of(graph: &Graph, edge: usize) -> Self {
         let factor = &graph.edges()[edge];
-        match graph.bends.get(&edge) {
+        match graph.correlations.get(&edge) {
             None => Self::Of(variables_of(graph, factor)),
-            Some(bend) => Self::Bent(graph.nodes_of(bend, factor)),
+            Some(correlation) => Self::CorrelatedResidual(graph.nodes_of(correlation, factor)),
         }
     }
 
@@ -418,7 +354,7 @@ impl Variables {
     pub(super) fn pairs(&self) -> Vec<(usize, usize)> {
         let list: Vec<usize> = match self {
             Self::Of(parts) => parts.iter().map(|(variable, _)| *variable).collect(),
-            Self::Bent(nodes) => nodes.iter().filter_map(|node| node.checked_sub(1)).collect(),
+            Self::CorrelatedResidual(nodes) => nodes.iter().filter_map(|node| node.checked_sub(1)).collect(),
         };
         list.iter().enumerate().flat_map(|(k, &a)| list[k..].iter().map(move |&b| (a, b))).collect()
     }

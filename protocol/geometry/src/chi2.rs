@@ -1,6 +1,6 @@
 //! Quantiles of χ², by degrees of freedom from 1: the squared normalised error of an honest estimate lies below the
-//! quantile at p in a share p of all cases. Computed to the last digit from the regularised incomplete gamma function; the
-//! test computes their tails another way.
+//! quantile at p in a share p of all cases. Computed to the last digit from the regularised incomplete gamma function;
+//! the test computes their tails another way.
 
 /// At 95 %.
 pub const P95: [f64; 7] = [

@@ -9,8 +9,8 @@ use crate::ids::Hash;
 /// constant, of an order of sums, of what counts. `sim/fingerprints.txt` shows such a change.
 pub const ESTIMATE_VERSION: u32 = 1;
 
-/// `{version}-{16 hexadecimal digits}`: the digits are of the options of `core.estimate` that change the map. How often a
-/// robot solves (`interval_secs`) does not.
+/// `{version}-{16 hexadecimal digits}`: the digits are of the options of `core.estimate` that change the map. How often
+/// a robot solves (`interval_secs`) does not.
 pub fn fingerprint(config: &EstimateConfig) -> String {
     let EstimateConfig { alignments_min, log10_nfa_max, covariance_scale_max, iterations_max, interval_secs: _ } =
         config;

@@ -2,7 +2,7 @@
 
 use super::dense::{Panel, Scratch};
 use super::{BlockPattern, Front, Piece};
-use crate::solve::SolveError;
+use crate::solve_error::SolveError;
 use std::collections::BTreeSet;
 use std::ops::Range;
 

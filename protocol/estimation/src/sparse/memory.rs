@@ -6,7 +6,7 @@
 //! Counting saturates, and what saturates is refused.
 
 use super::order::Elimination;
-use crate::solve::SolveError;
+use crate::solve_error::SolveError;
 
 /// Bytes that solving one component may take: its factor twice (the inverse is drawn from panels of its own, which may
 /// be as many), with the updates on the stack or what the inverse keeps and works on beside. For whoever solves a graph

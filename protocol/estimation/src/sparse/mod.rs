@@ -19,7 +19,7 @@ mod tree;
 #[cfg(test)]
 mod tree_tests;
 
-use super::solve::SolveError;
+use super::solve_error::SolveError;
 pub(super) use clique::Sum;
 pub(super) use front::{Factor, Workspace};
 pub(super) use inverse::SelectedInverse;

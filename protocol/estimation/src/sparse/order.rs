@@ -4,7 +4,7 @@
 //! elimination tree (Liu 1990). Columns of equal structure form a supernode; small supernodes are merged with their
 //! parent where that stores few zeros, because one dense product is cheaper than two (Ashcraft and Grimes 1989).
 
-use super::super::solve::SolveError;
+use super::super::solve_error::SolveError;
 use super::memory::Count;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::sparse::SymbolicSparseColMatRef;

@@ -8,7 +8,7 @@ use super::clique::{Clique, Sum};
 use super::memory::{self, FACTOR_BYTES_MAX};
 use super::order::{self, Elimination, Supernode};
 use super::tree::{CliqueTree, Memory, NONE, Terms};
-use crate::solve::SolveError;
+use crate::solve_error::SolveError;
 
 /// What is to be eliminated anew.
 struct Top {

@@ -11,7 +11,7 @@ use super::clique::{Clique, Sum};
 use super::dense::Scratch;
 use super::front::dot;
 use crate::geometry::sim3::{Matrix7, Vector7};
-use crate::solve::SolveError;
+use crate::solve_error::SolveError;
 
 /// What stands for "nowhere" in tables by variable.
 pub(super) const NONE: usize = usize::MAX;

@@ -198,7 +198,7 @@ fn a_hung_variable_touches_nothing_and_a_free_one_is_named() {
     squares.sizes.push(2);
     let free = tree.add_variable(2);
     let error = tree.revise(&squares, (&[3], &[]), (&[free], &[])).unwrap_err();
-    assert_eq!(error, crate::solve::SolveError::Underconstrained { variable: free });
+    assert_eq!(error, crate::solve_error::SolveError::Underconstrained { variable: free });
 }
 
 #[test]

@@ -163,8 +163,8 @@ impl<'a> PoseVerifier<'a> {
         self.close_look(self.polish(*pose, self.theirs.points.len(), &RADII), matches)
     }
 
-    /// The first [`POLISHED_MAX`] of those with a coarse score, but of poses near one of them only [`ALIKE_MAX`]: the rest of a
-    /// good one's neighbourhood must not crowd out its rivals.
+    /// The first [`POLISHED_MAX`] of those with a coarse score, but of poses near one of them only [`ALIKE_MAX`]: the
+    /// rest of a good one's neighbourhood must not crowd out its rivals.
     fn varied(&self, poses: &[Pose], coarse: &[(f64, usize)]) -> Vec<usize> {
         let mut chosen: Vec<usize> = Vec::new();
         for &(_, k) in coarse {
