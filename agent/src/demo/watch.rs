@@ -77,9 +77,15 @@ async fn look(
         let done = missing(tracks, &statuses).is_empty();
         // Answers of one look may be of different moments; twice in a row they are of the same state.
         if done && done_once {
-            break (Ending::Done, start.elapsed());
+            let after = start.elapsed();
+            let views = all_views(session, swarm).await?;
+            // A robot may have found something further to do since: then the end is not yet.
+            if missing(tracks, &views.iter().map(|views| Some(&views.status)).collect::<Vec<_>>()).is_empty() {
+                bar.finish_and_clear();
+                return Ok(Seen { ending: Ending::Done, after, views });
+            }
         }
-        done_once = done;
+        done_once = done && !done_once;
         if settling.look(&statuses) && start.elapsed() > playing {
             break (Ending::Settled, start.elapsed());
         }
