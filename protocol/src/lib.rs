@@ -26,7 +26,7 @@
 //!     while let Some(output) = agent.poll_output() {
 //!         match output {
 //!             Output::Run { id, job } => agent.handle(now, Input::JobDone { job: id, result: job.run() }),
-//!             Output::Persist { batch, .. } => agent.handle(now, Input::Persisted { up_to: batch }), // once it is durable
+//!             Output::Persist { batch, .. } => agent.handle(now, Input::Persisted { up_to: batch }), // once durable
 //!             Output::Ask { query, .. } => agent.handle(now, Input::Answered { query, bytes: None }), // or the answer
 //!             Output::Publish { .. } | Output::Answer { .. } | Output::Event(_) => {} // to the network and the log
 //!         }

@@ -33,7 +33,8 @@
 //!
 //! ```text
 //! "depth": {"width": 640, "height": 480, "fx": 585, "fy": 585, "cx": 320, "cy": 240, "unit_m": 0.001,
-//!           "range_m": [0.3, 4.0], "t_body_camera": {"translation": [0.1, 0, 0.3], "rotation": [-0.5, 0.5, -0.5, 0.5]},
+//!           "range_m": [0.3, 4.0],
+//!           "t_body_camera": {"translation": [0.1, 0, 0.3], "rotation": [-0.5, 0.5, -0.5, 0.5]},
 //!           "encoding": "raw", "data": "6AMAAOgD…"}
 //! ```
 //!

@@ -112,8 +112,8 @@ impl Admission {
         Some(Around { walk: self.walk(id)?, steps: [step(index.checked_sub(1)), step(Some(index))] })
     }
 
-    /// The first and the last anchor of a frame and the walks while their submaps were made, as far as their
-    /// neighbours' steps tell. Of a single step nobody knows whether it leads over a gap.
+    /// The first and the last anchor of a frame with the drift models of their submaps, as their neighbours' steps
+    /// tell. `None` for a frame of a single step, which may lead over a gap.
     pub(super) fn ends(&self, frame: FrameId) -> Option<[(SubmapId, DriftModel); 2]> {
         let last = self.chains.get(&frame)?.len().checked_sub(1).filter(|&last| last > 1)?;
         let last = u32::try_from(last).ok()?;

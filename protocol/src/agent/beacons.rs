@@ -1,8 +1,7 @@
-//! What other robots' pose beacons tell of when they were where, and how they move.
+//! When other robots were where, and how they move, by their pose beacons.
 //!
-//! A beacon states the keyframe that it tells of, on a clock that nobody else has. Of all beacons of a robot the one
-//! that took the least from the keyframe to us tells how the clocks differ, up to that least time; by it the others
-//! were late.
+//! A beacon states the stamp of its keyframe on its sender's own clock. The beacon of a robot that took the least time
+//! from its keyframe to us tells how the two clocks differ, up to that least time; how late the others were follows.
 
 use super::sighting::Twist;
 use crate::time::Instant;

@@ -407,7 +407,7 @@ impl Knowledge {
     }
 }
 
-/// Whether the observer says where another robot is, and nobody else does.
+/// Whether a sighting is of another robot and signed by its observer.
 fn is_of_another(id: EntryId, i: SubmapId, j: SubmapId) -> bool {
     i.frame.robot == id.frame.robot && j.frame.robot != id.frame.robot
 }

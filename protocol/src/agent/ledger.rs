@@ -22,7 +22,7 @@ pub(super) struct Ledger {
     pub(super) waiting: BTreeMap<u64, Batch>,
     /// The disk refused, and has not taken anything since.
     pub(super) fails: bool,
-    /// It was told that nobody would take a fact of our epoch.
+    /// Whether people were told that others would refuse facts of our epoch.
     limit_told: bool,
 }
 
@@ -164,7 +164,7 @@ impl Agent {
         self.ledger.fails
     }
 
-    /// Why nobody would take a fact of our epoch.
+    /// Why others would refuse a fact of our epoch, if they would.
     pub(super) fn epoch_limit(&self) -> Option<AppendError> {
         self.replica.check_epoch(self.me.frame).err().map(|_| AppendError::EpochLimit(self.me.robot))
     }

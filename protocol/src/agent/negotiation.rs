@@ -64,7 +64,7 @@ pub const FETCH_BACKOFF_MAX: Duration = Duration::from_secs(30);
 pub enum Purpose {
     /// To state it, if there is any.
     Propose(Prediction),
-    /// To answer somebody's alignment.
+    /// To answer an alignment that another robot stated.
     Verify(EntryId),
 }
 
@@ -97,7 +97,7 @@ pub struct Fetch {
 }
 
 impl Fetch {
-    /// Nothing came yet, nobody is asked.
+    /// A fetch of which nothing came yet and no peer is asked.
     pub fn new(owner: RobotId, now: Instant) -> Self {
         Self { got: Vec::new(), owner, query: None, failures: 0, not_before: now }
     }
@@ -111,7 +111,7 @@ pub struct Negotiation {
     candidates: Shortlist,
     tried: BTreeSet<Pair>,
     tries: BTreeMap<(SubmapId, FrameId), usize>,
-    /// What candidates promise.
+    /// How likely a candidate is to overlap.
     pub overlap_model: OverlapModel,
     /// Foreign alignments to answer.
     pub verify: BTreeSet<EntryId>,
@@ -228,8 +228,8 @@ impl Negotiation {
     }
 
     /// Notes an alignment to answer. Beyond [`VERIFICATIONS_MAX`] those of the robot with most that `waits` go, half of
-    /// them, the latest: whoever states what cannot be answered must not keep others from their answers, nor us busy
-    /// with making room.
+    /// them, the latest: a robot that states what cannot be answered must not keep others from their answers, nor us
+    /// busy with making room.
     pub fn add_verification(&mut self, id: EntryId, waits: impl Fn(&EntryId) -> bool) {
         if self.verify.len() >= VERIFICATIONS_MAX {
             let mut waiting: BTreeMap<RobotId, Vec<EntryId>> = BTreeMap::new();

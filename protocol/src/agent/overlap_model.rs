@@ -84,7 +84,7 @@ impl Usual {
         }
     }
 
-    /// Of what nobody knows: somewhere in the middle.
+    /// Of vectors of an unknown model: wide, about the middle.
     fn of_places() -> Self {
         Self { similarity: 0.6, spread: 0.2, odds: -0.5, slope: 1.0, sigma: 3.0 }
     }

@@ -1,10 +1,10 @@
-//! Blobs by their address, of which the oldest go: two that one look takes are fetched one after the other, and must
-//! not make each other go, as the first by address would.
+//! Blobs by their address. The oldest goes first: the two blobs of one look are fetched one after the other, and
+//! neither must displace the other.
 
 use crate::ids::Hash;
 use std::collections::BTreeMap;
 
-/// See the module. Whoever fills it holds the limit.
+/// See the module. The caller holds the limit.
 #[derive(Debug)]
 pub struct Recent<T> {
     kept: BTreeMap<Hash, (u64, T)>,

@@ -142,7 +142,7 @@ impl Agent {
         let first = self.keypoints_at(blob, submap)?;
         let Some(address) = first.further().filter(|_| further) else { return Some((first, None)) };
         let more = self.keypoints_at(address, submap)?;
-        // Whoever names what does not fit is looked at as if he had named nothing.
+        // Further keypoints that do not fit the first ones are left out.
         Some(first.with_further(&more).map_or((first, None), |both| (Arc::new(both), Some(address))))
     }
 }

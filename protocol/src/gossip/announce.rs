@@ -99,7 +99,8 @@ impl Announce {
         !silent
     }
 
-    /// A message to many is dear, and most of them hear the news from somebody else.
+    /// The cost of an announcement, in copies: one that many hear costs more, and most of them hear the news from
+    /// others.
     fn copies(&self) -> f64 {
         (self.hearers as f64 / FEW).max(1.0)
     }

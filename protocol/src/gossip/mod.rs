@@ -9,7 +9,8 @@
 //!   what follows a large one: after a partition the last few facts are as welcome as the first many. A question that
 //!   is overdue keeps nobody back: others are asked, then the same neighbour again, and what the lost one cost is given
 //!   back. Questions that bring nothing, because what they ask for is on its way, become dearer, as long as news keep
-//!   coming. How long is overdue, answers tell (RFC 6298), and what is at stake: nobody waits long for little.
+//!   coming. When a question is overdue follows from the times of earlier answers (RFC 6298) and
+//!   from how many facts are expected: for few the wait is short.
 //! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
 //! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
 //!   pause that doubles until either side changes.

@@ -31,7 +31,7 @@ const GIVEN_UP_FREE: u32 = 3;
 const GIVEN_UP_MAX: u32 = 4;
 /// Shortest patience with a question: less, and answers that were only queued are fetched twice.
 const PATIENCE_MIN: Duration = Duration::from_millis(300);
-/// Who waits for little loses little if it is fetched twice.
+/// Patience with a question for each fact that is expected: of few facts little is lost if they are fetched twice.
 const PATIENCE_PER_FACT: Duration = Duration::from_millis(10);
 
 /// One neighbour.

@@ -7,11 +7,11 @@
 //! [`JUMP_SUBMAPS_MAX`]. And, once it is known how this front end hands over keyframes, it must be *usual*: not beyond
 //! [`STEPS_MAX`] of its longest steps, nor beyond twice its speed for up to [`LOST_SECS_MAX`]. The last is relative, so
 //! that it holds in any unit, for a car as for a crawler. Each is widened by four of the stated standard deviations:
-//! whoever says that he does not know the motion is believed.
+//! a front end that states a large covariance of the motion may make a long step.
 //!
-//! What time has passed counts only so far, since a SLAM that restarts takes seconds: what the body may have driven
-//! meanwhile nobody measured. Only after [`SILENT_SECS_MIN`] may a step span [`SILENT_SUBMAPS_MAX`] submaps in any
-//! case.
+//! The time since the last keyframe allows a longer step only up to a bound: a SLAM that restarts takes seconds, and
+//! what the body may have driven meanwhile was not measured. Only after [`SILENT_SECS_MIN`] may a step span
+//! [`SILENT_SUBMAPS_MAX`] submaps in any case.
 //!
 //! A keyframe that does not go on is refused, and remembered. If the next ones go on from *it*, the frame is another
 //! one. Between the old way and the new one the nearer counts, so that the robot's new way, which may lead past the old

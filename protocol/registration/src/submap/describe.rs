@@ -50,7 +50,7 @@ fn in_space(submap: &Submap, config: &SubmapConfig) -> Described {
     let points: Vec<[f32; 3]> = submap.cloud.iter().take(FEATURES_MAX).copied().collect();
     let extent = [0, 1, 2].map(|axis| points.iter().fold(0.0, |most: f32, p| most.max(p[axis].abs())));
     let mut block = Block::new(config.voxel_m, extent.iter().fold(0.0, |most, &e| most.max(f64::from(e))));
-    // Points too far out for the block are nobody's neighbours either.
+    // Points beyond the block's reach are left out; they are no neighbours of the others.
     let within: Vec<usize> = (0..points.len()).filter(|&k| block.reaches(&points[k])).collect();
     let voxel = block.voxel();
     let at: Vec<[f32; 3]> = within.iter().map(|&k| points[k].map(|x| (f64::from(x) / voxel) as f32)).collect();

@@ -169,8 +169,8 @@ fn turn_variances(motions: &[PoseWithCovariance], anchor: usize, keyframes: usiz
 const TILT_SIGMA_ROUGH: f64 = 0.06;
 /// ...and polished ones hardly by one.
 const TILT_SIGMA: f64 = 0.02;
-/// Who knows the vertical less well than this, rad, had better take the ground from what is seen: over a hundred voxels
-/// it would be three off.
+/// Largest standard deviation of a vertical, rad, by which the ground is found: over a hundred voxels it errs by three.
+/// With a larger one the ground is taken from what is seen.
 const GROUND_SIGMA_MAX: f64 = 0.03;
 
 /// Both verticals of a pair of submaps.

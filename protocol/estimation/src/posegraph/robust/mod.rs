@@ -6,8 +6,8 @@
 //!
 //! 1. Each robot's own closures that agree with its odometry show how much noise there really is (`noise`).
 //! 2. Pairs of robots go through the consensus of a swarm's frames (`seed`).
-//! 3. Closures that the map contradicts are dropped and those that agree with it are let in, whoever left them out,
-//!    judged with the map's covariance (`world`); what now counts tells the noise better, and more may agree.
+//! 3. Closures that the map contradicts are dropped and those that agree with it are let in, whichever step left them
+//!    out, judged with the map's covariance (`world`); what now counts tells the noise better, and more may agree.
 //! 4. Parts of the map that few closures tie are merged where those agree through them (`merge`), several together
 //!    where no two can be told (`cluster`), and all begins again at 3 until nothing changes.
 //!

@@ -104,7 +104,7 @@ pub fn agree(matches: &[Match], area: f64, rival_ratio: f64, rotation_sigma_max:
     if !covariance.iter().all(|x| x.is_finite()) || rotation_sigma > rotation_sigma_max {
         return Err(LandmarkError::Degenerate { rotation_sigma });
     }
-    // Residuals larger than stated are noise nobody stated; smaller ones may be luck.
+    // Residuals larger than stated tell of further noise, which widens the covariance; smaller ones may be chance.
     let freedom = (2 * members - 3) as f64;
     let covariance = covariance * (best.chi2 / freedom).max(1.0);
     let square = |&k: &usize| (matches[k].mine.at - best.pose.apply(&matches[k].theirs.at)).norm_squared();
