@@ -5,11 +5,11 @@
 use crate::journal::{self, Frame, StoredInput};
 use crate::queue::{Inbox, Outbox};
 use crate::store;
-use merganser_protocol::agent::Agent;
+use merganser_protocol::agent::Core;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, JobId, Output, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
 use merganser_protocol::ids::{Hash, RobotId};
-use merganser_protocol::snapshot::{Snapshot, StatusView};
+use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::submap::Keyframe;
 use merganser_protocol::time::Instant;
 use std::sync::Arc;
@@ -25,55 +25,6 @@ const JOURNAL_FLUSH: Duration = Duration::from_millis(500);
 const PARKING: Duration = Duration::from_secs(5);
 /// Requests for snapshots that may wait.
 const VIEWS_WAITING: usize = 16;
-
-/// What the driver drives: the real core, or a stand-in of a test.
-pub trait Core: Send + 'static {
-    /// See [`Agent::handle`].
-    fn handle(&mut self, now: Instant, input: Input);
-    /// See [`Agent::poll_output`].
-    fn poll_output(&mut self) -> Option<Output>;
-    /// See [`Agent::poll_timeout`].
-    fn poll_timeout(&self) -> Option<Instant>;
-    /// See [`Agent::digest`].
-    fn digest(&self) -> Hash;
-    /// See [`Agent::status`].
-    fn status(&self) -> StatusView;
-    /// See [`Agent::store_fails`].
-    fn store_fails(&self) -> bool;
-    /// What the core believes now.
-    fn snapshot(&self, now: Instant) -> Snapshot;
-    /// See [`Agent::overview`].
-    fn overview(&self, now: Instant) -> Snapshot {
-        self.snapshot(now)
-    }
-}
-
-impl Core for Agent {
-    fn handle(&mut self, now: Instant, input: Input) {
-        Self::handle(self, now, input);
-    }
-    fn poll_output(&mut self) -> Option<Output> {
-        Self::poll_output(self)
-    }
-    fn poll_timeout(&self) -> Option<Instant> {
-        Self::poll_timeout(self)
-    }
-    fn digest(&self) -> Hash {
-        Self::digest(self)
-    }
-    fn status(&self) -> StatusView {
-        Self::status(self)
-    }
-    fn store_fails(&self) -> bool {
-        Self::store_fails(self)
-    }
-    fn snapshot(&self, now: Instant) -> Snapshot {
-        Self::snapshot(self, now)
-    }
-    fn overview(&self, now: Instant) -> Snapshot {
-        Self::overview(self, now)
-    }
-}
 
 /// What the core wants sent. Sending never blocks: a network that cannot keep up drops and counts.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -183,7 +134,7 @@ pub struct Driver<C, N> {
     inputs: u64,
 }
 
-impl<C: Core, N: Network> Driver<C, N> {
+impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
     /// A driver, and the way to ask it for snapshots.
     pub fn new(parts: Parts<C, N>) -> (Self, Snapshots) {
         let (sender, views) = mpsc::channel(VIEWS_WAITING);
@@ -207,7 +158,9 @@ impl<C: Core, N: Network> Driver<C, N> {
                 Some(SnapshotRequest { map, reply }) = self.views.recv() => {
                     let core = &self.parts.core;
                     let seen = if map { core.snapshot(clock.now()) } else { core.overview(clock.now()) };
-                    let _ = reply.send(seen); // whoever asked may have gone
+                    if let Some(seen) = seen {
+                        let _ = reply.send(seen); // whoever asked may have gone
+                    }
                     None
                 }
                 input = self.parts.outbox.next() => input,
@@ -226,7 +179,7 @@ impl<C: Core, N: Network> Driver<C, N> {
         let clock = self.parts.clock;
         let deadline = clock.now().after(PARKING);
         self.handle(Input::Command(Command::Flush));
-        while self.unsaved() {
+        while self.parts.core.is_saving() {
             let input = tokio::select! {
                 biased;
                 () = clock.reach(deadline) => {
@@ -239,10 +192,6 @@ impl<C: Core, N: Network> Driver<C, N> {
                 self.handle(input);
             }
         }
-    }
-
-    fn unsaved(&self) -> bool {
-        self.parts.core.status().unsaved > 0 && !self.parts.core.store_fails()
     }
 
     /// When to send [`Input::Timeout`]. Right after one, not at once: inputs must have their turn.

@@ -2,14 +2,14 @@
 //! program runs one of these; tests run several in one process.
 
 use crate::config::{FileConfig, FileConfigError};
-use crate::driver::{Clock, Core, Driver, Finished, Parts, Snapshots};
+use crate::driver::{Clock, Driver, Finished, Parts, Snapshots};
 use crate::journal::{self, Start};
 use crate::link::Link;
 use crate::link::scouting::Scouting;
 use crate::link::session::LinkError;
 use crate::queue::{Inbox, queue};
 use crate::store;
-use merganser_protocol::agent::{Agent, StartError};
+use merganser_protocol::agent::{Agent, Core, StartError};
 use merganser_store::{Opened, Store, StoreError};
 use rand::TryRng;
 use std::io;
@@ -107,7 +107,7 @@ impl Host {
     /// [`HostError`].
     pub async fn assemble(
         config: &FileConfig,
-        core: impl Core,
+        core: impl Core + Send + 'static,
         store: Store,
         journal: Option<journal::Writer>,
         clock: Clock,

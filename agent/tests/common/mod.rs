@@ -3,14 +3,13 @@
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use merganser::config::FileConfig;
-use merganser::driver::Core;
 use merganser::host::{Host, Options};
 use merganser::trust::SecretKey;
-use merganser_protocol::agent::Agent;
 use merganser_protocol::agent::io::{Input, Output};
+use merganser_protocol::agent::{Agent, Core};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::ids::{Hash, Name};
-use merganser_protocol::snapshot::{Snapshot, StatusView};
+use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::{Instant, Stamp};
 use nalgebra::Vector3;
@@ -114,14 +113,8 @@ impl Core for Puppet {
     fn digest(&self) -> Hash {
         Hash::of(b"puppet")
     }
-    fn status(&self) -> StatusView {
-        real_core_of_nobody().status()
-    }
-    fn store_fails(&self) -> bool {
-        false
-    }
-    fn snapshot(&self, now: Instant) -> Snapshot {
-        real_core_of_nobody().snapshot(now)
+    fn snapshot(&self, now: Instant) -> Option<Snapshot> {
+        Some(real_core_of_nobody().snapshot(now))
     }
 }
 

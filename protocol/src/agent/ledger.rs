@@ -156,12 +156,12 @@ impl Agent {
 
     /// Nothing of our own can be written now. What others write is heard, kept if the disk takes it, and served.
     pub(super) fn is_receive_only(&self) -> bool {
-        self.store_fails() || self.epoch_limit().is_some()
+        self.ledger.fails || self.epoch_limit().is_some()
     }
 
-    /// The disk refuses what must be kept: nothing that waits for it will be durable soon.
-    pub fn store_fails(&self) -> bool {
-        self.ledger.fails
+    /// Something is on its way to the disk, and the disk takes it: an end now would lose what a moment would save.
+    pub fn is_saving(&self) -> bool {
+        self.unsaved() > 0 && !self.ledger.fails
     }
 
     /// Why others would refuse a fact of our epoch, if they would.

@@ -12,6 +12,7 @@ mod beacons;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
+mod core;
 pub mod estimate_version;
 mod gossip;
 pub mod io;
@@ -65,6 +66,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use steps::Steps;
 use thiserror::Error;
 
+pub use self::core::Core;
 pub use condensing::GONE_IN_A_ROW_MAX;
 pub use gossip::BLOBS_MAX;
 pub use knowledge::Agreement;

@@ -65,7 +65,7 @@ impl Agent {
     }
 
     /// What a restart now would lose.
-    fn unsaved(&self) -> u64 {
+    pub(super) fn unsaved(&self) -> u64 {
         (self.ledger.waiting.len() + self.ledger.open.len() + self.mapper.pending()) as u64
     }
 

@@ -5,7 +5,7 @@ use super::robot::{Asked, job_nanos};
 use super::store::Committed;
 use super::{Event, OUTPUTS_MAX, Swarm, TOLD_MAX, Told, hostile};
 use crate::check::Seen;
-use crate::core::Core;
+use crate::core::Restartable;
 use crate::network::{Tampering, millis};
 use crate::world::drive::Step;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Input, Output, QueryKind};
@@ -17,7 +17,7 @@ use merganser_protocol::time::Instant;
 /// A timeout is never nearer than this, so that virtual time moves even under a core that is always due.
 const WAKE_NANOS_MIN: u64 = 1_000;
 
-impl<C: Core> Swarm<C> {
+impl<C: Restartable> Swarm<C> {
     fn publish(&mut self, now: Instant, robot: usize, channel: Channel, bytes: Vec<u8>) {
         let bytes = self.in_its_version(robot, bytes);
         self.robots[robot].count(now, channel_name(channel), bytes.len());

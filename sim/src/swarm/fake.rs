@@ -1,14 +1,13 @@
 //! A stand-in for the core, for the simulator's own tests: it writes an entry per keyframe, publishes it once it is
 //! durable, and repairs by asking neighbours for everything when a heard digest differs. It can be told to misbehave.
 
-use crate::core::Core;
+use crate::core::Restartable;
 use core::cell::RefCell;
 use core::time::Duration;
 use merganser_protocol::agent::io::{Channel, Input, Output, QueryId, QueryKind, Record};
-use merganser_protocol::agent::{Identity, Restored, StartError};
+use merganser_protocol::agent::{Core, Identity, Restored, StartError};
 use merganser_protocol::config::Config;
 use merganser_protocol::ids::{EntryId, FrameId, Hash, RobotId};
-use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::time::Instant;
 use std::collections::{BTreeMap, VecDeque};
 
@@ -63,7 +62,7 @@ pub struct Fake {
 const HAVE: Duration = Duration::from_millis(500);
 const ENTRY_LEN: usize = 48;
 
-impl Core for Fake {
+impl Restartable for Fake {
     fn start(
         _config: Config,
         identity: Identity,
@@ -94,6 +93,22 @@ impl Core for Fake {
         })
     }
 
+    fn frame(&self) -> FrameId {
+        self.frame
+    }
+
+    fn logs(&self) -> BTreeMap<FrameId, Option<u32>> {
+        let mut logs = BTreeMap::new();
+        for id in self.entries.keys() {
+            // Entries come in any order here: a log counts up to its first hole.
+            let len: &mut Option<u32> = logs.entry(id.frame).or_insert(Some(0));
+            *len = len.map(|len| if len == id.seq { len + 1 } else { len });
+        }
+        logs
+    }
+}
+
+impl Core for Fake {
     fn handle(&mut self, now: Instant, input: Input) {
         match input {
             Input::Keyframe(keyframe) => {
@@ -155,26 +170,8 @@ impl Core for Fake {
         Some(if bug() == Bug::NeverRests { Instant::ZERO } else { self.next_have })
     }
 
-    fn frame(&self) -> FrameId {
-        self.frame
-    }
-
     fn digest(&self) -> Hash {
         Hash::of(&self.entries.values().flatten().copied().collect::<Vec<u8>>())
-    }
-
-    fn logs(&self) -> BTreeMap<FrameId, Option<u32>> {
-        let mut logs = BTreeMap::new();
-        for id in self.entries.keys() {
-            // Entries come in any order here: a log counts up to its first hole.
-            let len: &mut Option<u32> = logs.entry(id.frame).or_insert(Some(0));
-            *len = len.map(|len| if len == id.seq { len + 1 } else { len });
-        }
-        logs
-    }
-
-    fn snapshot(&self, _now: Instant) -> Option<Snapshot> {
-        None
     }
 }
 

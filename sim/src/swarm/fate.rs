@@ -3,7 +3,7 @@
 use super::robot::{NewFrame, Robot};
 use super::{Event, Swarm, SwarmError, secs};
 use crate::check::Seen;
-use crate::core::Core;
+use crate::core::Restartable;
 use crate::dice::Dice;
 use crate::faults::Fault;
 use crate::network::millis;
@@ -17,7 +17,7 @@ const SUPERVISOR_SECS: f64 = 1.0;
 /// Time that a power cut in the middle of a commit waits for one, s.
 const MID_COMMIT_SECS: f64 = 1.0;
 
-impl<C: Core> Swarm<C> {
+impl<C: Restartable> Swarm<C> {
     pub(super) fn boot(&mut self, now: Instant, index: usize) -> Result<(), SwarmError> {
         let robot = &mut self.robots[index];
         if robot.core.is_some() || robot.gone {

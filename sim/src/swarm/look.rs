@@ -3,7 +3,7 @@
 use super::robot::Robot;
 use super::{Event, Swarm, all_agree, all_done};
 use crate::check::{Phase, RobotSample, Sample, Seen};
-use crate::core::Core;
+use crate::core::Restartable;
 use crate::field::{Layout, TICK};
 use crate::network::millis;
 use merganser_protocol::snapshot::SubmapView;
@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 /// Between two samples at most, s.
 const SAMPLE_SECS_MAX: f64 = 20.0;
 
-impl<C: Core> Swarm<C> {
+impl<C: Restartable> Swarm<C> {
     /// Notices who can hear whom, and plans to tell those for whom it changed.
     pub(super) fn update_hearing(&mut self, now: Instant) {
         let options = self.network.options().clone();

@@ -18,7 +18,7 @@ pub use robot::Usage;
 pub use stopwatch::Stopwatch;
 
 use crate::check::{Checks, Phase, RobotSample, Sample, Violation};
-use crate::core::Core;
+use crate::core::Restartable;
 use crate::dice::Dice;
 use crate::faults::FaultCounts;
 use crate::field::Field;
@@ -144,7 +144,7 @@ enum Event {
     Sample,
 }
 
-impl<C: Core> Swarm<C> {
+impl<C: Restartable> Swarm<C> {
     /// A swarm at time zero.
     ///
     /// # Errors

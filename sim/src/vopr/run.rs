@@ -2,7 +2,7 @@
 
 use super::draw;
 use crate::check::Violation;
-use crate::core::Core;
+use crate::core::Restartable;
 use crate::faults::FaultCounts;
 use crate::swarm::{Outcome, Swarm};
 use merganser_protocol::agent::Agent;
@@ -35,7 +35,7 @@ pub fn run_seed(seed: u64, robots: Option<usize>, twice: bool) -> SeedReport {
     run_with::<Agent>(seed, robots, twice)
 }
 
-fn run_with<C: Core>(seed: u64, robots: Option<usize>, twice: bool) -> SeedReport {
+fn run_with<C: Restartable>(seed: u64, robots: Option<usize>, twice: bool) -> SeedReport {
     let mut report = one::<C>(seed, robots);
     if twice && report.violation.is_none() {
         let again = one::<C>(seed, robots);
@@ -48,7 +48,7 @@ fn run_with<C: Core>(seed: u64, robots: Option<usize>, twice: bool) -> SeedRepor
     report
 }
 
-fn one<C: Core>(seed: u64, robots: Option<usize>) -> SeedReport {
+fn one<C: Restartable>(seed: u64, robots: Option<usize>) -> SeedReport {
     let scenario = draw(seed, robots);
     let storm = scenario.duration_secs + scenario.machine.start_within_secs;
     let robots = scenario.robots;
