@@ -43,8 +43,9 @@ impl Agent {
     /// Pairs a submap that became known with all that it may overlap: one of ours with all, one of another's with ours.
     fn note_candidates(&mut self, new: SubmapId) {
         let Some(known) = self.knowledge.submap(new) else { return };
-        let looks = Looks { me: self.me.robot, knowledge: &self.knowledge, config: &self.config.align };
-        if new.frame.robot != self.me.robot {
+        let looks =
+            Looks { me: self.context.robot(), knowledge: &self.knowledge, config: &self.context.config().align };
+        if new.frame.robot != self.context.robot() {
             looks.pair_up(&mut self.negotiation, &looks.ours(), [(new, known)].into_iter());
         } else if let Some(summary) = &known.summary {
             looks.pair_up(&mut self.negotiation, &[(new, summary)], self.knowledge.submaps());
@@ -53,7 +54,8 @@ impl Agent {
 
     /// Pairs all of our submaps with all that they may overlap.
     pub(super) fn note_all_candidates(&mut self) {
-        let looks = Looks { me: self.me.robot, knowledge: &self.knowledge, config: &self.config.align };
+        let looks =
+            Looks { me: self.context.robot(), knowledge: &self.knowledge, config: &self.context.config().align };
         looks.pair_up(&mut self.negotiation, &looks.ours(), self.knowledge.submaps());
         self.negotiation.mark_dirty();
     }
@@ -66,8 +68,9 @@ impl Agent {
         }
         self.negotiation.mark_tried((fact.i, fact.j));
         self.negotiation.peer_requests.remove((fact.i, fact.j));
-        let ours = fact.i.frame.robot == self.me.robot || fact.j.frame.robot == self.me.robot;
-        let owed = ours && id.frame.robot != self.me.robot && !self.knowledge.has_verdict(id, self.me.robot);
+        let ours = fact.i.frame.robot == self.context.robot() || fact.j.frame.robot == self.context.robot();
+        let owed =
+            ours && id.frame.robot != self.context.robot() && !self.knowledge.has_verdict(id, self.context.robot());
         if owed {
             self.owe_answer(id);
         }
@@ -83,17 +86,17 @@ impl Agent {
     fn report_agreement(&mut self, alignment: EntryId) {
         let Some(fact) = self.knowledge.alignment(alignment) else { return };
         let (i, j) = (fact.i, fact.j);
-        if i.frame.robot != self.me.robot && j.frame.robot != self.me.robot {
+        if i.frame.robot != self.context.robot() && j.frame.robot != self.context.robot() {
             return;
         }
         match self.knowledge.agreement(alignment) {
             Agreement::Agreed => {
-                self.stats.worked("agreed");
-                self.event(Event::AlignmentAgreed { i, j });
+                self.context.count().worked("agreed");
+                self.context.event(Event::AlignmentAgreed { i, j });
             }
             Agreement::Disputed => {
-                self.stats.worked("disputed");
-                self.event(Event::AlignmentDisputed { i, j });
+                self.context.count().worked("disputed");
+                self.context.event(Event::AlignmentDisputed { i, j });
             }
             Agreement::Waiting => {}
         }
@@ -105,7 +108,7 @@ impl Agent {
 
     /// Starts as many alignments as allowed: answers owed first, then the most promising candidates.
     pub(super) fn start_aligning(&mut self) {
-        let further = self.allowance.take_due(self.now);
+        let further = self.allowance.take_due(self.context.now());
         if (self.negotiation.take_stirred() || further) && !self.is_receive_only() {
             self.start_verifying();
             if self.has_room() || !self.negotiation.fetches.is_empty() {
@@ -118,7 +121,7 @@ impl Agent {
     }
 
     fn has_room(&self) -> bool {
-        self.negotiation.running.len() < self.config.align.jobs_max
+        self.negotiation.running.len() < self.context.config().align.jobs_max
     }
 
     fn start_verifying(&mut self) {
@@ -143,22 +146,22 @@ impl Agent {
     fn start_proposing(&mut self, active: &[Proposal]) {
         self.negotiation.begun.retain(|begun| active.iter().any(|p| pair_of(p.mine, p.theirs) == *begun));
         for &Proposal { mine, theirs, may_wait, bytes, prediction, further } in active {
-            if !self.has_room() || self.negotiation.is_fetching_enough(self.now) {
+            if !self.has_room() || self.negotiation.is_fetching_enough(self.context.now()) {
                 break;
             }
             let pair = pair_of(mine, theirs);
             if !self.negotiation.begun.contains(&pair) {
                 match may_wait {
-                    true if !self.allowance.may_spend(self.now) => continue,
-                    true => self.allowance.spend(self.now, bytes),
+                    true if !self.allowance.may_spend(self.context.now()) => continue,
+                    true => self.allowance.spend(self.context.now(), bytes),
                     // A loop of our own is stated once, and moves no keypoints.
                     false if self.is_loop(mine, theirs) => {}
-                    false => self.allowance.owe(self.now, bytes),
+                    false => self.allowance.owe(self.context.now(), bytes),
                 }
                 self.negotiation.begun.insert(pair);
             }
             // Without features (evicted, or never described) the pair cannot be tried: off the list as well.
-            let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.me.robot);
+            let mut ours = [mine, theirs].into_iter().filter(|id| id.frame.robot == self.context.robot());
             let lacks = ours.any(|id| self.negotiation.features(id).is_none());
             if lacks || self.start_alignment(mine, theirs, Purpose::Propose(prediction), further) {
                 self.negotiation.mark_tried(pair);
@@ -197,20 +200,20 @@ impl Agent {
         }
         let scale = self.knowledge.submap(theirs).map_or(ScaleKind::Unknown, |fact| fact.scale);
         // Whatever the unit is, within one frame it is the same.
-        let metric =
-            mine.frame == theirs.frame || (self.config.submap.scale, scale) == (ScaleKind::Metric, ScaleKind::Metric);
+        let metric = mine.frame == theirs.frame
+            || (self.context.config().submap.scale, scale) == (ScaleKind::Metric, ScaleKind::Metric);
         let job = AlignJob {
             theirs: keypoints,
             mine: features,
             back: back.flatten(),
-            config: self.config.align.clone(),
-            voxel_m: self.config.submap.voxel_m,
-            sensor: self.config.submap.sensor,
+            config: self.context.config().align.clone(),
+            voxel_m: self.context.config().submap.voxel_m,
+            sensor: self.context.config().submap.sensor,
             verticals: self.verticals(mine, theirs),
             scale: if metric { ScaleKind::Metric } else { ScaleKind::Unknown },
             seed: self.pair_seed(pair_of(mine, theirs)),
         };
-        let id = self.run_job(Job::Align(Box::new(job)));
+        let id = self.context.run_job(Job::Align(Box::new(job)));
         self.negotiation.running.insert(id, Work { mine, theirs, purpose, further: used });
         true
     }
@@ -240,7 +243,7 @@ impl Agent {
         if let Some(Ok(keypoints)) = self.gossip.blob(blob).map(Keypoints::decode) {
             return Some(Arc::new(keypoints));
         }
-        let fetch = || Fetch::new(submap.frame.robot, self.now);
+        let fetch = || Fetch::new(submap.frame.robot, self.context.now());
         self.negotiation.fetches.entry(blob).or_insert_with(fetch);
         None
     }
@@ -248,7 +251,7 @@ impl Agent {
     /// A seed of our own for this pair: independent of the other endpoint's, the same in a replay.
     fn pair_seed(&self, pair: Pair) -> u64 {
         let mut bytes = Vec::with_capacity(80);
-        bytes.extend_from_slice(&self.me.robot.0);
+        bytes.extend_from_slice(&self.context.robot().0);
         for id in [pair.0, pair.1] {
             bytes.extend_from_slice(&id.frame.robot.0);
             bytes.extend_from_slice(&id.frame.epoch.to_le_bytes());
@@ -256,7 +259,7 @@ impl Agent {
         }
         let Hash(hash) = Hash::of(&bytes);
         let [a, b, c, d, e, f, g, h, ..] = hash;
-        u64::from_le_bytes([a, b, c, d, e, f, g, h]) ^ self.seed
+        u64::from_le_bytes([a, b, c, d, e, f, g, h]) ^ self.context.seed()
     }
 
     /// Stops fetching what no pair needs any more: of those that were active, the ones that have not begun.
@@ -273,7 +276,7 @@ impl Agent {
     }
 
     fn start_fetching(&mut self) {
-        let idle = |fetch: &Fetch| fetch.query.is_none() && fetch.not_before <= self.now;
+        let idle = |fetch: &Fetch| fetch.query.is_none() && fetch.not_before <= self.context.now();
         let due: Vec<(Hash, Option<RobotId>, usize)> = self
             .negotiation
             .fetches
@@ -285,11 +288,13 @@ impl Agent {
             FETCHES_MAX.saturating_sub(self.negotiation.fetches.values().filter(|f| f.query.is_some()).count());
         for (hash, peer, offset) in due {
             let query = match peer {
-                Some(peer) if free > 0 && self.gossip.may_fetch(self.now) => self.fetch_blob(hash, offset, peer),
+                Some(peer) if free > 0 && self.gossip.may_fetch(self.context.now()) => {
+                    self.fetch_blob(hash, offset, peer)
+                }
                 // Nobody to ask, enough under way, or too soon: look again later.
                 _ => {
                     let idle = peer.is_none() || free == 0;
-                    let later = if idle { self.now.after(FETCH_AGAIN) } else { self.gossip.next_piece() };
+                    let later = if idle { self.context.now().after(FETCH_AGAIN) } else { self.gossip.next_piece() };
                     self.negotiation.fetches.entry(hash).and_modify(|fetch| fetch.not_before = later);
                     continue;
                 }
@@ -318,7 +323,7 @@ impl Agent {
             Some(false) => Err(RefusalReason::NoConsensus.into()),
             None => return self.put_off(&work),
         };
-        self.stats.worked(if outcome.is_ok() { "aligned" } else { "refused" });
+        self.context.count().worked(if outcome.is_ok() { "aligned" } else { "refused" });
         match work.purpose {
             Purpose::Propose(prediction) => {
                 self.tell_try(&work, prediction, outcome.is_ok());
@@ -348,7 +353,7 @@ impl Agent {
     /// Of two of our own submaps, one fits at another place as well: all are told so, once of either, so that no single
     /// bare submap speaks for a whole frame. Of submaps of another epoch nothing is told.
     fn note_lookalike(&mut self, work: &Work, why: NotAligned) {
-        let ((i, j), frame) = (pair_of(work.mine, work.theirs), self.me.frame);
+        let ((i, j), frame) = (pair_of(work.mine, work.theirs), self.context.frame());
         // Second looks speak for no merge, and against none.
         let is_of_ours = i.frame == frame && j.frame == frame && work.further.is_none();
         if !why.elsewhere || !is_of_ours {
@@ -364,11 +369,11 @@ impl Agent {
     fn tell_try(&mut self, work: &Work, prediction: Prediction, found: bool) {
         let (i, j) = pair_of(work.mine, work.theirs);
         if work.further.is_some() {
-            self.stats.worked(if found { "second_look_aligned" } else { "second_look_refused" });
-            return self.event(Event::LookedAgain { i, j, found });
+            self.context.count().worked(if found { "second_look_aligned" } else { "second_look_refused" });
+            return self.context.event(Event::LookedAgain { i, j, found });
         }
         self.negotiation.overlap_model.learn(&prediction.features, found);
-        self.event(Event::AlignmentTried { i, j, expected: prediction.probability, found });
+        self.context.event(Event::AlignmentTried { i, j, expected: prediction.probability, found });
     }
 
     /// A second look of which our map cannot say any more whether it agrees: an answer that is owed waits until it can.
@@ -381,7 +386,7 @@ impl Agent {
     fn propose(&mut self, work: &Work, measured: &Measured) {
         let (i, j) = pair_of(work.mine, work.theirs);
         let Some(blobs) = self.blobs_used(work) else { return };
-        self.event(Event::AlignmentProposed { i, j, support: measured.support });
+        self.context.event(Event::AlignmentProposed { i, j, support: measured.support });
         let fact = Fact::Alignment(AlignmentFact {
             i,
             j,
@@ -391,11 +396,11 @@ impl Agent {
             log10_nfa: measured.log10_nfa as f32,
             blobs,
         });
-        self.write(self.me.frame.epoch, &fact);
+        self.write(self.context.frame().epoch, &fact);
     }
 
     fn write_verdict(&mut self, alignment: EntryId, outcome: VerdictOutcome) {
-        self.write(self.me.frame.epoch, &Fact::Verdict(VerdictFact { alignment, outcome }));
+        self.write(self.context.frame().epoch, &Fact::Verdict(VerdictFact { alignment, outcome }));
     }
 
     /// The most similar pair that the other endpoint should try and that would join frames not yet merged.

@@ -39,8 +39,8 @@ pub(super) struct Shorter {
 impl Agent {
     /// Shortens our log, if it is long and all of it is durable.
     pub(super) fn condense(&mut self) {
-        let frame = self.me.frame;
-        let wanted = self.config.gossip.condense_entries;
+        let frame = self.context.frame();
+        let wanted = self.context.config().gossip.condense_entries;
         let Some(held) = self.replica.settled(frame) else { return };
         let count = held.end - held.start;
         if wanted == 0 || self.is_receive_only() || count < wanted.max(self.condensing.again_at) {
@@ -56,27 +56,29 @@ impl Agent {
         if after as f64 > WORTHWHILE * before as f64 {
             return;
         }
-        match self.replica.append_floor(&self.me.key, frame.epoch, &shorter.parts) {
+        match self.replica.append_floor(&self.context.me().key, frame.epoch, &shorter.parts) {
             Ok(new) => self.replace(frame, &new, &shorter.gone, [before, after]),
-            Err(error) => self.reject(Some(self.me.robot), "own fact: condensed", &error.to_string()),
+            Err(error) => self.context.reject(Some(self.context.robot()), "own fact: condensed", &error.to_string()),
         }
     }
 
     fn replace(&mut self, frame: FrameId, new: &[Entry], gone: &[(SubmapId, Hash)], bytes: [usize; 2]) {
         self.condensing.again_at = u32::try_from(2 * new.len()).unwrap_or(u32::MAX);
         let Some(below) = new.first().map(Entry::id) else { return };
-        self.ledger.open.extend(new.iter().map(|entry| Record::Entry { id: entry.id(), bytes: entry.encode() }));
+        for entry in new {
+            self.context.keep(Record::Entry { id: entry.id(), bytes: entry.encode() });
+        }
         let submaps = gone.iter().map(|(submap, _)| *submap).collect();
         // Two submaps can share a blob: equal bytes have one address.
         let stays = |id: &SubmapId| gone.binary_search_by_key(id, |(submap, _)| *submap).is_err();
         let all = self.knowledge.submaps().filter(|(id, _)| stays(id));
         let kept = self.with_further(all.map(|(_, known)| known.blob));
         let blobs = self.with_further(gone.iter().map(|(_, blob)| *blob)).difference(&kept).copied().collect();
-        self.ledger.open.push(Record::Replaced { below, submaps, blobs });
+        self.context.keep(Record::Replaced { below, submaps, blobs });
         gone.iter().for_each(|(submap, _)| self.negotiation.forget(*submap));
         self.forget_refusals(|submap| gone.binary_search_by_key(&submap, |(id, _)| *id).is_ok());
-        self.stats.condensed(bytes);
-        self.event(Event::Condensed { frame, parts: new.len(), submaps_gone: gone.len(), bytes });
+        self.context.count().condensed(bytes);
+        self.context.event(Event::Condensed { frame, parts: new.len(), submaps_gone: gone.len(), bytes });
     }
 }
 

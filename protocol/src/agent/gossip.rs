@@ -115,20 +115,20 @@ impl Gossip {
 impl Agent {
     pub(super) fn gossip_timeout(&self) -> Option<Instant> {
         let Gossip { spread, traffic, .. } = &self.gossip;
-        let speak = spread.timeout().max(traffic.due(self.now, Class::Have));
-        [Some(speak), Some(self.pose_due()), traffic.timeout(self.now)].into_iter().flatten().min()
+        let speak = spread.timeout().max(traffic.due(self.context.now(), Class::Have));
+        [Some(speak), Some(self.pose_due()), traffic.timeout(self.context.now())].into_iter().flatten().min()
     }
 
     pub(super) fn run_timers(&mut self) {
         self.expire_questions();
         self.publish_unsent();
         self.spread();
-        if self.now >= self.pose_due() {
-            self.gossip.posed = (self.now, self.stamp());
+        if self.context.now() >= self.pose_due() {
+            self.gossip.posed = (self.context.now(), self.stamp());
             self.publish_pose();
         }
-        if self.now >= self.gossip.next_wish {
-            self.gossip.next_wish = self.now.after(WISH_EVERY);
+        if self.context.now() >= self.gossip.next_wish {
+            self.gossip.next_wish = self.context.now().after(WISH_EVERY);
             self.send_wish();
         }
     }
@@ -136,9 +136,12 @@ impl Agent {
     /// Does what the gossip about facts wants done now, as long as there is room for it.
     fn spread(&mut self) {
         // While received entries wait for the disk our vector is stale: asking now would fetch them twice.
-        let busy = !self.ledger.waiting.is_empty() || !self.ledger.open.is_empty();
-        while self.gossip.traffic.may(self.now, Class::Have) {
-            let Some(step) = self.gossip.spread.step(self.now, &self.replica, busy, &mut self.rng) else { return };
+        let busy = !self.ledger.waiting.is_empty() || self.context.kept() > 0;
+        while self.gossip.traffic.may(self.context.now(), Class::Have) {
+            let Some(step) = self.gossip.spread.step(self.context.now(), &self.replica, busy, self.context.rng())
+            else {
+                return;
+            };
             match step {
                 Step::Announce(root) => self.publish(Channel::Have, &Message::Have(root)),
                 Step::Ask { peer, have } => {
@@ -146,7 +149,7 @@ impl Agent {
                 }
             }
         }
-        if self.gossip.spread.timeout() <= self.now {
+        if self.gossip.spread.timeout() <= self.context.now() {
             self.may_speak();
         }
     }
@@ -156,7 +159,7 @@ impl Agent {
     fn pose_due(&self) -> Instant {
         let (at, told) = self.gossip.posed;
         let pauses = if self.stamp() == told { REPEAT_PAUSES } else { 1.0 };
-        at.after(Duration::from_secs_f64(pauses * self.config.gossip.pose_secs))
+        at.after(Duration::from_secs_f64(pauses * self.context.config().gossip.pose_secs))
     }
 
     /// Of our last keyframe, once there is a beacon to send of it.
@@ -170,12 +173,12 @@ impl Agent {
         }
         let Some((index, t_anchor_body, stamp)) = self.mapper.body() else { return };
         self.gossip.beacon_counter += 1;
-        let anchor = SubmapId { frame: self.me.frame, index };
+        let anchor = SubmapId { frame: self.context.frame(), index };
         let counter = self.gossip.beacon_counter;
         let content = BeaconContent { anchor, stamp, counter, t_anchor_body };
-        match Beacon::sign(&self.me.key, self.replica.swarm(), &content) {
+        match Beacon::sign(&self.context.me().key, self.replica.swarm(), &content) {
             Ok(beacon) => self.publish(Channel::Pose, &Message::Pose(beacon)),
-            Err(error) => self.reject(Some(self.me.robot), "own pose", &error.to_string()),
+            Err(error) => self.context.reject(Some(self.context.robot()), "own pose", &error.to_string()),
         }
     }
 
@@ -184,19 +187,19 @@ impl Agent {
     }
 
     fn ask(&mut self, peer: RobotId, kind: QueryKind, message: &Message, about: About) -> QueryId {
-        let query = self.new_query();
+        let query = self.context.new_query();
         let bytes = self.pay_for(message);
-        let expires = self.now.after(Duration::from_secs_f64(3.0 * self.config.gossip.answer_secs));
-        self.gossip.questions.insert(query, Question { peer, about, asked: self.now, expires });
-        self.outputs.push_back(Output::Ask { query, peer, kind, bytes });
+        let expires = self.context.now().after(Duration::from_secs_f64(3.0 * self.context.config().gossip.answer_secs));
+        self.gossip.questions.insert(query, Question { peer, about, asked: self.context.now(), expires });
+        self.context.put(Output::Ask { query, peer, kind, bytes });
         query
     }
 
     pub(super) fn on_neighbour(&mut self, robot: RobotId, up: bool) {
-        if robot == self.me.robot || self.replica.name_of(robot).is_none() {
+        if robot == self.context.robot() || self.replica.name_of(robot).is_none() {
             return;
         }
-        if self.gossip.spread.on_neighbour(self.now, robot, up, &mut self.rng) && up {
+        if self.gossip.spread.on_neighbour(self.context.now(), robot, up, self.context.rng()) && up {
             self.negotiation.out_of_reach.clear();
             self.negotiation.mark_dirty();
         }
@@ -205,15 +208,15 @@ impl Agent {
     pub(super) fn on_received(&mut self, from: RobotId, channel: Channel, bytes: &[u8]) {
         let message = match Message::decode(bytes) {
             Ok(message) => message,
-            Err(error) => return self.reject(Some(from), error.reason(), &error.to_string()),
+            Err(error) => return self.context.reject(Some(from), error.reason(), &error.to_string()),
         };
-        self.stats.received(message.kind(), bytes.len());
+        self.context.count().received(message.kind(), bytes.len());
         match (channel, message) {
             (Channel::Pose, Message::Pose(beacon)) => self.on_beacon(from, &beacon),
             (Channel::Facts, Message::Facts(_)) if self.is_overloaded() => {
                 // Nothing is lost: it comes again when the sets are compared.
                 let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk");
-                self.reject(Some(from), "facts: overload", &detail);
+                self.context.reject(Some(from), "facts: overload", &detail);
             }
             (Channel::Facts, Message::Facts(entries)) => {
                 for entry in &entries {
@@ -221,18 +224,22 @@ impl Agent {
                 }
             }
             (Channel::Have, Message::Have(_)) if self.replica.name_of(from).is_none() => {
-                self.reject(Some(from), "have: unknown robot", "the key names a robot that is not in the roster");
+                self.context.reject(
+                    Some(from),
+                    "have: unknown robot",
+                    "the key names a robot that is not in the roster",
+                );
             }
             (Channel::Have, Message::Have(have)) => {
-                self.gossip.spread.on_have(self.now, &self.replica, from, have);
+                self.gossip.spread.on_have(self.context.now(), &self.replica, from, have);
             }
-            (_, other) => self.reject(Some(from), "wrong channel", other.kind()),
+            (_, other) => self.context.reject(Some(from), "wrong channel", other.kind()),
         }
     }
 
     fn on_beacon(&mut self, from: RobotId, beacon: &Beacon) {
         if !self.replica.verify_beacon(beacon) {
-            return self.reject(Some(from), "pose: signature", "beacon not signed by the robot it names");
+            return self.context.reject(Some(from), "pose: signature", "beacon not signed by the robot it names");
         }
         let robot = beacon.robot();
         let newer = self.gossip.beacons.get(&robot).is_none_or(|seen| {
@@ -240,8 +247,8 @@ impl Agent {
             let age = |content: &BeaconContent| (content.anchor.frame.epoch, content.stamp, content.counter);
             age(beacon) > age(&seen.content)
         });
-        if newer && robot != self.me.robot {
-            let seen = SeenBeacon::after(self.gossip.beacons.get(&robot), **beacon, self.now);
+        if newer && robot != self.context.robot() {
+            let seen = SeenBeacon::after(self.gossip.beacons.get(&robot), **beacon, self.context.now());
             self.gossip.beacons.insert(robot, seen);
         }
     }
@@ -249,8 +256,8 @@ impl Agent {
     /// Asks for the next piece of a blob. Pieces are paced: on a slow link a whole blob would delay poses by half a
     /// second, whatever their priority, because the queue is the kernel's.
     pub(super) fn fetch_blob(&mut self, hash: Hash, offset: usize, peer: RobotId) -> QueryId {
-        let pause = BLOB_PIECE_LEN as f64 / self.config.gossip.blob_bytes_per_sec;
-        self.gossip.next_piece = self.now.after(Duration::from_secs_f64(pause));
+        let pause = BLOB_PIECE_LEN as f64 / self.context.config().gossip.blob_bytes_per_sec;
+        self.gossip.next_piece = self.context.now().after(Duration::from_secs_f64(pause));
         let request = Message::BlobRequest { hash, offset: offset as u32, len: BLOB_PIECE_LEN as u32 };
         self.ask(peer, QueryKind::Blob, &request, About::Blob(hash))
     }
@@ -260,7 +267,7 @@ impl Agent {
         if !self.may_speak() {
             return;
         }
-        let peer = if pair.0.frame.robot == self.me.robot { pair.1.frame.robot } else { pair.0.frame.robot };
+        let peer = if pair.0.frame.robot == self.context.robot() { pair.1.frame.robot } else { pair.0.frame.robot };
         let request = Message::AlignRequest { i: pair.0, j: pair.1 };
         self.ask(peer, QueryKind::Align, &request, About::Align);
     }
@@ -272,12 +279,12 @@ impl Agent {
             None => None,
             Some(Ok(message)) => Some(message),
             Some(Err(error)) => {
-                self.reject(Some(question.peer), error.reason(), &error.to_string());
+                self.context.reject(Some(question.peer), error.reason(), &error.to_string());
                 None
             }
         };
         if let (Some(message), Some(bytes)) = (&answer, bytes) {
-            self.stats.received(message.kind(), bytes.len());
+            self.context.count().received(message.kind(), bytes.len());
         }
         match (question.about, answer) {
             (About::Sync, Some(Message::SyncReply(delta))) => {
@@ -297,13 +304,13 @@ impl Agent {
             (About::Blob(hash), Some(Message::BlobReply { hash: named, offset, total, bytes })) if named == hash => {
                 self.on_piece(query, question.peer, hash, (offset, total), &bytes);
             }
-            (About::Blob(_), _) => self.negotiation.fetch_failed(query, self.now),
+            (About::Blob(_), _) => self.negotiation.fetch_failed(query, self.context.now()),
             (About::Align, _) => {}
         }
     }
 
     fn synced(&mut self, question: &Question, answer: Answer) {
-        self.gossip.spread.on_answer(self.now, &self.replica, question.peer, question.asked, answer);
+        self.gossip.spread.on_answer(self.context.now(), &self.replica, question.peer, question.asked, answer);
     }
 
     /// A piece of a blob came. Pieces may come from different robots; the hash of the whole decides.
@@ -315,7 +322,7 @@ impl Agent {
             return self.fetch_postponed(query, hash);
         }
         if !goes_on || !is_piece(piece.len(), left) {
-            return self.negotiation.fetch_failed(query, self.now);
+            return self.negotiation.fetch_failed(query, self.context.now());
         }
         fetch.got.extend_from_slice(piece);
         self.gossip.traffic.not_postponed(hash);
@@ -328,12 +335,12 @@ impl Agent {
         if Hash::of(&bytes) == hash {
             self.keep_blob(bytes);
         } else {
-            self.reject(Some(peer), "blob: wrong hash", "the bytes are not those the hash names");
+            self.context.reject(Some(peer), "blob: wrong hash", "the bytes are not those the hash names");
         }
         if self.negotiation.keypoints(hash).is_some() {
             self.negotiation.fetches.remove(&hash);
         } else {
-            self.negotiation.fetch_failed(query, self.now);
+            self.negotiation.fetch_failed(query, self.context.now());
         }
     }
 
@@ -341,11 +348,11 @@ impl Agent {
     pub(super) fn on_asked(&mut self, token: AskToken, kind: QueryKind, bytes: &[u8]) {
         let answer = match Message::decode(bytes) {
             Ok(message) => {
-                self.stats.received(message.kind(), bytes.len());
+                self.context.count().received(message.kind(), bytes.len());
                 self.answer(kind, message)
             }
             Err(error) => {
-                self.reject(None, error.reason(), &error.to_string());
+                self.context.reject(None, error.reason(), &error.to_string());
                 None
             }
         };
@@ -355,27 +362,29 @@ impl Agent {
             QueryKind::Align => Class::Have,
         };
         let bytes = answer.map_or_else(Vec::new, |message| self.pay_for_answer(class, &message));
-        self.outputs.push_back(Output::Answer { token, bytes });
+        self.context.put(Output::Answer { token, bytes });
     }
 
     fn answer(&mut self, kind: QueryKind, question: Message) -> Option<Message> {
         match (kind, question) {
             (QueryKind::Sync, Message::SyncRequest(have)) => {
                 let have = self.replica.read_have(&have)?;
-                self.gossip.spread.on_asked(self.now, &self.replica, &have);
+                self.gossip.spread.on_asked(self.context.now(), &self.replica, &have);
                 Some(Message::SyncReply(self.repair(&have)))
             }
             (QueryKind::Blob, Message::BlobRequest { hash, offset, len }) => {
                 self.piece(hash, offset as usize, len as usize)
             }
             // What others wish takes what is left, so that nobody's wishes keep us from repairing.
-            (QueryKind::Align, Message::AlignRequest { i, j }) if self.gossip.traffic.may(self.now, Class::Blob) => {
+            (QueryKind::Align, Message::AlignRequest { i, j })
+                if self.gossip.traffic.may(self.context.now(), Class::Blob) =>
+            {
                 let pair = pair_of(i, j);
                 Some(Message::AlignReply { status: self.wished(pair) })
             }
             (QueryKind::Align, Message::AlignRequest { .. }) => None,
             (_, other) => {
-                self.reject(None, "wrong question", other.kind());
+                self.context.reject(None, "wrong question", other.kind());
                 None
             }
         }
@@ -395,8 +404,13 @@ impl Agent {
 
     /// Shells answer every question; should one fail to, it must not block us for ever.
     fn expire_questions(&mut self) {
-        let expired: Vec<QueryId> =
-            self.gossip.questions.iter().filter(|(_, q)| self.now >= q.expires).map(|(query, _)| *query).collect();
+        let expired: Vec<QueryId> = self
+            .gossip
+            .questions
+            .iter()
+            .filter(|(_, q)| self.context.now() >= q.expires)
+            .map(|(query, _)| *query)
+            .collect();
         for query in expired {
             self.on_answered(query, None);
         }

@@ -16,8 +16,6 @@ pub const BATCHES_WAITING_MAX: usize = 1_024;
 /// Records on their way to the disk.
 #[derive(Default)]
 pub(super) struct Ledger {
-    /// Of this call; they leave together at its end.
-    pub(super) open: Vec<Record>,
     last_batch: u64,
     pub(super) waiting: BTreeMap<u64, Batch>,
     /// The disk refused, and has not taken anything since.
@@ -38,12 +36,12 @@ impl Agent {
     /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
     /// here; what was under way waits for the disk with the rest. False if the fact cannot be written.
     pub(super) fn write(&mut self, epoch: u32, fact: &Fact) -> bool {
-        match self.replica.append(&self.me.key, epoch, fact) {
-            Ok(entry) => self.ledger.open.push(Record::Entry { id: entry.id(), bytes: entry.encode() }),
+        match self.replica.append(&self.context.me().key, epoch, fact) {
+            Ok(entry) => self.context.keep(Record::Entry { id: entry.id(), bytes: entry.encode() }),
             Err(error) => {
-                self.reject(Some(self.me.robot), "own fact", &error.to_string());
-                if matches!(error, AppendError::NewEpochNeeded(frame, _) if frame == self.me.frame) {
-                    self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::Log);
+                self.context.reject(Some(self.context.robot()), "own fact", &error.to_string());
+                if matches!(error, AppendError::NewEpochNeeded(frame, _) if frame == self.context.frame()) {
+                    self.begin_epoch(self.context.frame().epoch.saturating_add(1), EpochReason::Log);
                 }
                 return false;
             }
@@ -57,9 +55,9 @@ impl Agent {
             Ok(Ingested::New(ids)) => {
                 for id in ids {
                     let Some(bytes) = self.replica.entry_bytes(id) else { continue };
-                    self.ledger.open.push(Record::Entry { id, bytes: bytes.to_vec() });
+                    self.context.keep(Record::Entry { id, bytes: bytes.to_vec() });
                     if self.replica.is_floor(id) {
-                        self.ledger.open.push(Record::Replaced { below: id, submaps: vec![], blobs: vec![] });
+                        self.context.keep(Record::Replaced { below: id, submaps: vec![], blobs: vec![] });
                     }
                     self.meet_own_past(id.frame);
                 }
@@ -68,13 +66,13 @@ impl Agent {
             Ok(Ingested::Early(id)) => self.meet_own_end(id.frame),
             Ok(Ingested::Known) => {}
             Err(error @ IngestError::Fork(frame)) => {
-                self.reject(Some(frame.robot), error.reason(), &error.to_string());
+                self.context.reject(Some(frame.robot), error.reason(), &error.to_string());
                 self.keep_proof(frame);
                 self.relearn();
                 return true;
             }
             Err(error) => {
-                self.reject(from, error.reason(), &error.to_string());
+                self.context.reject(from, error.reason(), &error.to_string());
                 if let IngestError::TooEarly(id) = error {
                     self.meet_own_end(id.frame);
                 }
@@ -87,36 +85,42 @@ impl Agent {
     pub(super) fn ingest_fork(&mut self, from: RobotId, [a, b]: &[EntryBytes; 2]) -> bool {
         match self.replica.ingest_fork(&a.0, &b.0) {
             Ok((frame, true)) => {
-                self.reject(Some(frame.robot), "fork", &format!("log {frame} has two histories; it is quarantined"));
+                self.context.reject(
+                    Some(frame.robot),
+                    "fork",
+                    &format!("log {frame} has two histories; it is quarantined"),
+                );
                 self.keep_proof(frame);
                 self.relearn();
                 return true;
             }
             Ok((_, false)) => {}
-            Err(error) => self.reject(Some(from), error.reason(), &error.to_string()),
+            Err(error) => self.context.reject(Some(from), error.reason(), &error.to_string()),
         }
         false
     }
 
     /// A log that is in quarantine stays there over restarts.
     fn keep_proof(&mut self, frame: FrameId) {
-        self.gossip.spread.on_news(self.now, 1);
+        self.gossip.spread.on_news(self.context.now(), 1);
         let proof = self.replica.forks().find(|(forked, _)| *forked == frame);
         let proof = proof.map(|(_, proof)| [proof.a.clone(), proof.b.clone()]);
-        self.ledger.open.extend(proof.map(|proof| Record::Fork { frame, proof }));
+        if let Some(proof) = proof {
+            self.context.keep(Record::Fork { frame, proof });
+        }
         self.meet_own_end(frame);
     }
 
     /// A peer holds entries that we signed but no longer have: our store was lost. What we write must not collide, and
     /// no later run may take this log for one to go on with: what we hold of it may be less than others do.
     fn meet_own_past(&mut self, FrameId { robot, epoch }: FrameId) {
-        if robot != self.me.robot {
+        if robot != self.context.robot() {
             return;
         }
-        if epoch >= self.me.frame.epoch {
+        if epoch >= self.context.frame().epoch {
             self.begin_epoch(epoch.saturating_add(1), EpochReason::Log);
         } else {
-            self.ledger.open.push(Record::EpochClosed { epoch });
+            self.context.keep(Record::EpochClosed { epoch });
             self.tell_of_limit();
         }
     }
@@ -124,7 +128,7 @@ impl Agent {
     /// The same of a past that we cannot hold, because it has two histories or its beginning is yet to come: what we
     /// write before the end of it would be refused.
     fn meet_own_end(&mut self, frame: FrameId) {
-        if frame.epoch >= self.me.frame.epoch {
+        if frame.epoch >= self.context.frame().epoch {
             self.meet_own_past(frame);
         }
     }
@@ -133,10 +137,10 @@ impl Agent {
     /// the new epoch has an entry.
     pub(super) fn begin_epoch(&mut self, epoch: u32, reason: EpochReason) {
         self.close_submap();
-        self.me.frame.epoch = epoch;
-        self.ledger.open.push(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
+        self.context.set_epoch(epoch);
+        self.context.keep(Record::EpochClosed { epoch: epoch.saturating_sub(1) });
         self.mapper.restart(reason == EpochReason::Session);
-        self.event(Event::EpochBegan { frame: self.me.frame, reason });
+        self.context.event(Event::EpochBegan { frame: self.context.frame(), reason });
         self.tell_of_limit();
     }
 
@@ -145,7 +149,7 @@ impl Agent {
         if let Some(error) = self.epoch_limit()
             && !core::mem::replace(&mut self.ledger.limit_told, true)
         {
-            self.event(Event::ReceiveOnly { reason: error.to_string() });
+            self.context.event(Event::ReceiveOnly { reason: error.to_string() });
         }
     }
 
@@ -166,15 +170,15 @@ impl Agent {
 
     /// Why others would refuse a fact of our epoch, if they would.
     pub(super) fn epoch_limit(&self) -> Option<AppendError> {
-        self.replica.check_epoch(self.me.frame).err().map(|_| AppendError::EpochLimit(self.me.robot))
+        self.replica.check_epoch(self.context.frame()).err().map(|_| AppendError::EpochLimit(self.context.robot()))
     }
 
     pub(super) fn close_batch(&mut self) {
-        if self.ledger.open.is_empty() && !self.refusals.are_many() {
+        if self.context.kept() == 0 && !self.refusals.are_many() {
             return;
         }
         self.save_refusals();
-        let records = core::mem::take(&mut self.ledger.open);
+        let records = self.context.take_records();
         self.ledger.last_batch += 1;
         let mut batch = Batch::default();
         for record in &records {
@@ -185,7 +189,7 @@ impl Agent {
             }
         }
         self.ledger.waiting.insert(self.ledger.last_batch, batch);
-        self.outputs.push_back(Output::Persist { batch: self.ledger.last_batch, records });
+        self.context.put(Output::Persist { batch: self.ledger.last_batch, records });
     }
 
     pub(super) fn on_persisted(&mut self, up_to: u64) {
@@ -193,7 +197,7 @@ impl Agent {
         let durable = core::mem::replace(&mut self.ledger.waiting, later);
         if core::mem::take(&mut self.ledger.fails) {
             self.negotiation.mark_dirty();
-            self.event(Event::StoreHealed);
+            self.context.event(Event::StoreHealed);
         }
         let mut own = Vec::new();
         let (mut entries, mut blobs) = (Vec::new(), Vec::new());
@@ -201,11 +205,11 @@ impl Agent {
             entries.extend(batch.entries);
             blobs.extend(batch.blobs);
         }
-        self.gossip.spread.on_news(self.now, entries.len());
+        self.gossip.spread.on_news(self.context.now(), entries.len());
         for id in entries {
             self.replica.mark_durable(id);
             self.learn(id);
-            if id.frame.robot == self.me.robot {
+            if id.frame.robot == self.context.robot() {
                 own.push(id);
             }
         }
@@ -219,7 +223,7 @@ impl Agent {
 
     pub(super) fn on_persist_failed(&mut self, reason: String) {
         if !core::mem::replace(&mut self.ledger.fails, true) {
-            self.event(Event::ReceiveOnly { reason: format!("the store fails: {reason}") });
+            self.context.event(Event::ReceiveOnly { reason: format!("the store fails: {reason}") });
         }
     }
 }

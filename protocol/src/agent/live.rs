@@ -33,8 +33,8 @@ impl Agent {
     /// Every robot whose pose is known, this one first; the others ascend.
     pub(super) fn live(&self, now: Instant) -> Vec<Live> {
         let own = self.mapper.body().map(|(index, t_anchor_body, stamp)| {
-            let anchor = SubmapId { frame: self.me.frame, index };
-            Live { robot: self.me.robot, anchor, t_anchor_body, age_secs: 0.0, stamp_secs: stamp.as_secs_f64() }
+            let anchor = SubmapId { frame: self.context.frame(), index };
+            Live { robot: self.context.robot(), anchor, t_anchor_body, age_secs: 0.0, stamp_secs: stamp.as_secs_f64() }
         });
         let others = self.gossip.beacons().map(|(robot, seen)| Live {
             robot,
@@ -58,8 +58,8 @@ impl Agent {
             let all: BTreeSet<u32> = known.into_iter().chain(latest).collect();
             all.into_iter().map(|index| SubmapId { frame, index }).collect()
         };
-        let live = self.live(self.now);
-        let is_ours_first = live.first().is_some_and(|first| first.robot == self.me.robot);
+        let live = self.live(self.context.now());
+        let is_ours_first = live.first().is_some_and(|first| first.robot == self.context.robot());
         pairs_among(&live.iter().map(anchors_of).collect::<Vec<_>>(), is_ours_first)
     }
 
@@ -67,10 +67,10 @@ impl Agent {
     pub(super) fn robot_view(&self, live: &Live) -> RobotView {
         let t_own_body = self.t_own_body(live.anchor, &live.t_anchor_body);
         RobotView {
-            robot: self.robot_name(live.robot),
+            robot: self.context.robot_name(live.robot),
             age_secs: live.age_secs,
             stamp_secs: live.stamp_secs,
-            anchor: self.submap_name(live.anchor),
+            anchor: self.context.submap_name(live.anchor),
             t_own_body: t_own_body.as_ref().map(RelationView::from),
         }
     }
@@ -81,7 +81,7 @@ impl Agent {
         let related = pairs.filter_map(|(a, b)| {
             let t_anchor_anchor = self.t_anchor_anchor(a.anchor, b.anchor)?;
             let t_a_b = between_bodies(&a.t_anchor_body, &t_anchor_anchor, &b.t_anchor_body);
-            let [a, b] = [a, b].map(|live| self.robot_name(live.robot));
+            let [a, b] = [a, b].map(|live| self.context.robot_name(live.robot));
             Some(RobotPairView { a, b, t_a_b: RelationView::from(&t_a_b) })
         });
         related.collect()

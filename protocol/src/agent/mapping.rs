@@ -91,12 +91,12 @@ impl Mapper {
 impl Agent {
     pub(super) fn on_keyframe(&mut self, keyframe: Keyframe) {
         if let Some(error) = self.epoch_limit() {
-            return self.reject(Some(self.me.robot), "keyframe: receive-only", &error.to_string());
+            return self.context.reject(Some(self.context.robot()), "keyframe: receive-only", &error.to_string());
         }
         if self.mapper.queue.len() >= DESCRIBE_QUEUE_MAX {
             let detail = format!("{DESCRIBE_QUEUE_MAX} submaps wait to be described; raise submap.distance_m");
             self.mapper.builder.pass(&keyframe);
-            self.reject(Some(self.me.robot), "keyframe: overload", &detail);
+            self.context.reject(Some(self.context.robot()), "keyframe: overload", &detail);
             return;
         }
         if let Some(sign) = self.mapper.builder.another_frame(&keyframe) {
@@ -104,9 +104,9 @@ impl Agent {
                 FrameSign::Session => EpochReason::Session,
                 FrameSign::Jump => EpochReason::Jumped,
             };
-            self.begin_epoch(self.me.frame.epoch.saturating_add(1), reason);
+            self.begin_epoch(self.context.frame().epoch.saturating_add(1), reason);
             if let Some(error) = self.epoch_limit() {
-                return self.reject(Some(self.me.robot), "keyframe: receive-only", &error.to_string());
+                return self.context.reject(Some(self.context.robot()), "keyframe: receive-only", &error.to_string());
             }
         }
         let (stamp, pose) = (keyframe.stamp, keyframe.pose.pose);
@@ -120,10 +120,10 @@ impl Agent {
                 self.enqueue(closed);
             }
             Err(error) => {
-                self.reject(Some(self.me.robot), "keyframe", &error.to_string());
+                self.context.reject(Some(self.context.robot()), "keyframe", &error.to_string());
                 let is_behind = matches!(error, KeyframeError::StampNotRising { .. });
-                if is_behind && self.mapper.is_clock_back(self.now, stamp) {
-                    self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::ClockBack);
+                if is_behind && self.mapper.is_clock_back(self.context.now(), stamp) {
+                    self.begin_epoch(self.context.frame().epoch.saturating_add(1), EpochReason::ClockBack);
                 }
             }
         }
@@ -135,7 +135,7 @@ impl Agent {
         let runs = self.mapper.builder.runs();
         if let Some(session) = runs.now().filter(|now| Some(*now) != before) {
             let over = runs.over().collect();
-            self.ledger.open.push(Record::Session { epoch: self.me.frame.epoch, session, over });
+            self.context.keep(Record::Session { epoch: self.context.frame().epoch, session, over });
         }
     }
 
@@ -146,10 +146,10 @@ impl Agent {
 
     fn enqueue(&mut self, closed: Option<Submap>) {
         if let Some(misfit_voxels) = self.mapper.builder.take_misfit() {
-            self.event(Event::ViewsDisagree { frame: self.me.frame, misfit_voxels });
+            self.context.event(Event::ViewsDisagree { frame: self.context.frame(), misfit_voxels });
         }
         if let Some(submap) = closed {
-            let id = SubmapId { frame: self.me.frame, index: submap.index };
+            let id = SubmapId { frame: self.context.frame(), index: submap.index };
             self.mapper.queue.push_back((id, submap));
         }
     }
@@ -161,8 +161,8 @@ impl Agent {
             return;
         }
         if let Some((id, submap)) = self.mapper.queue.pop_front() {
-            let config = self.config.submap.clone();
-            let job = self.run_job(Job::Describe(Box::new(DescribeJob { submap, config })));
+            let config = self.context.config().submap.clone();
+            let job = self.context.run_job(Job::Describe(Box::new(DescribeJob { submap, config })));
             self.mapper.describing = Some((job, id));
         }
     }
@@ -180,19 +180,19 @@ impl Agent {
             summary: described.summary.encode(),
             keypoint_count: u16::try_from(described.keypoints.len()).unwrap_or(u16::MAX),
             blob: hash,
-            scale: self.config.submap.scale,
+            scale: self.context.config().submap.scale,
             keyframes: u16::try_from(submap.keyframes.len()).ok().and_then(NonZero::new),
         });
         if !self.write(id.frame.epoch, &fact) {
             return;
         }
-        self.ledger.open.push(Record::Private { submap: id, bytes: described.features.encode() });
+        self.context.keep(Record::Private { submap: id, bytes: described.features.encode() });
         self.keep_keypoints(hash, &blob);
-        self.ledger.open.push(Record::Blob { hash, bytes: blob });
+        self.context.keep(Record::Blob { hash, bytes: blob });
         if let Some(bytes) = described.further.map(|further| further.encode()) {
-            self.ledger.open.push(Record::Blob { hash: Hash::of(&bytes), bytes });
+            self.context.keep(Record::Blob { hash: Hash::of(&bytes), bytes });
         }
-        self.event(Event::SubmapFinished { submap: id, keypoints: described.keypoints.len() });
+        self.context.event(Event::SubmapFinished { submap: id, keypoints: described.keypoints.len() });
         self.negotiation.add_features(id, Arc::new(described.features));
     }
 
@@ -200,19 +200,22 @@ impl Agent {
     pub(super) fn resume_mapping(&mut self, runs: Runs) {
         let mut t_frame_anchor = None;
         let mut next_index = 0;
-        let chain = self.knowledge.chains().remove(&self.me.frame).unwrap_or_default();
+        let chain = self.knowledge.chains().remove(&self.context.frame()).unwrap_or_default();
         for index in chain {
-            let Some(known) = self.knowledge.submap(SubmapId { frame: self.me.frame, index }) else { break };
+            let Some(known) = self.knowledge.submap(SubmapId { frame: self.context.frame(), index }) else { break };
             next_index = index + 1;
             t_frame_anchor = Some(t_frame_anchor.unwrap_or_else(Se3::identity) * known.t_prev_this);
         }
-        self.mapper.builder = SubmapBuilder::resume(self.config.submap.clone(), next_index, t_frame_anchor, runs);
+        self.mapper.builder =
+            SubmapBuilder::resume(self.context.config().submap.clone(), next_index, t_frame_anchor, runs);
     }
 
     pub(super) fn restore_features(&mut self, submap: SubmapId, bytes: &[u8]) {
         match Features::decode(bytes) {
             Ok(features) => self.negotiation.add_features(submap, Arc::new(features)),
-            Err(error) => self.reject(Some(self.me.robot), "store: features", &format!("{submap}: {error}")),
+            Err(error) => {
+                self.context.reject(Some(self.context.robot()), "store: features", &format!("{submap}: {error}"))
+            }
         }
     }
 
@@ -234,7 +237,7 @@ impl Agent {
                 true
             }
             Err(error) => {
-                self.reject(None, "blob", &error.to_string());
+                self.context.reject(None, "blob", &error.to_string());
                 false
             }
         }

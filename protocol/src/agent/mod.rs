@@ -12,6 +12,7 @@ mod beacons;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
+mod context;
 mod core;
 pub mod estimate_version;
 mod gossip;
@@ -48,21 +49,19 @@ use crate::time::Instant;
 use crate::wire::fact::Fact;
 use allowance::Allowance;
 use condensing::Condensing;
+use context::{Context, Me};
 use ed25519_dalek::SigningKey;
 use gossip::Gossip;
-use io::{Command, EpochReason, Event, Input, JobId, Output, QueryId, Record};
-use job::{Job, JobResult};
+use io::{Command, EpochReason, Input, JobId, Output, Record};
+use job::JobResult;
 use knowledge::Knowledge;
 use ledger::Ledger;
 use mapping::Mapper;
 use negotiation::Negotiation;
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
 use refusals::Refusals;
 use sighting::Positions;
 use solving::MapState;
-use stats::Stats;
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use steps::Steps;
 use thiserror::Error;
 
@@ -79,10 +78,6 @@ pub use refusals::{REFUSED_MAX, REFUSED_WAITING_MAX};
 pub use second_look::SECOND_LOOKS_MAX;
 pub use sighting::{SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
 pub use traffic::{POSTPONED_MAX, UNSENT_MAX};
-
-/// A clock that shows more (after 292 years, or because it is broken) stands still for the agent: pauses must end after
-/// they begin, or whatever is repeated after a pause would be repeated without one.
-const LATEST: Instant = Instant::from_nanos(u64::MAX / 2);
 
 /// Who this agent is and whom it trusts.
 #[derive(Clone)]
@@ -125,12 +120,7 @@ pub struct Restored {
 
 /// One robot's agent.
 pub struct Agent {
-    config: Config,
-    me: Me,
-    seed: u64,
-    rng: ChaCha8Rng,
-    now: Instant,
-    outputs: VecDeque<Output>,
+    context: Context,
     ledger: Ledger,
     replica: Replica,
     knowledge: Knowledge,
@@ -140,20 +130,8 @@ pub struct Agent {
     allowance: Allowance,
     gossip: Gossip,
     map: MapState,
-    stats: Stats,
     condensing: Condensing,
     positions: Positions,
-    next_job: u64,
-    next_query: u64,
-}
-
-/// This robot and its swarm.
-struct Me {
-    robot: RobotId,
-    frame: FrameId,
-    key: SigningKey,
-    name: Name,
-    swarm: Name,
 }
 
 impl Agent {
@@ -177,27 +155,23 @@ impl Agent {
         let robot = RobotId::of_key(&public);
         let replica = Replica::new(&identity.swarm, identity.roster, &config.gossip)?;
         let frame = FrameId { robot, epoch: restored.fresh_epoch };
+        let names = replica.members().map(|(robot, name)| (robot, name.clone())).collect();
+        let me = Me { frame, key, name: identity.name, swarm: identity.swarm, names };
+        let context = Context::new(config, me, seed, now);
+        let (config, now) = (context.config(), context.now());
         let mut agent = Self {
             mapper: Mapper::new(&config.submap),
             negotiation: Negotiation::new(config.submap.sensor),
-            refusals: Refusals::new(&config),
-            allowance: Allowance::new(config.align.further_bytes_per_sec, now.min(LATEST)),
-            gossip: Gossip::new(robot, &config.gossip, now.min(LATEST)),
-            me: Me { robot, frame, key, name: identity.name, swarm: identity.swarm },
-            rng: ChaCha8Rng::seed_from_u64(seed),
-            config,
-            seed,
-            now: now.min(LATEST),
+            refusals: Refusals::new(config),
+            allowance: Allowance::new(config.align.further_bytes_per_sec, now),
+            gossip: Gossip::new(robot, &config.gossip, now),
             replica,
-            outputs: VecDeque::new(),
             ledger: Ledger::default(),
             knowledge: Knowledge::default(),
             map: MapState::default(),
-            stats: Stats::default(),
             condensing: Condensing::default(),
             positions: Positions::default(),
-            next_job: 1,
-            next_query: 1,
+            context,
         };
         agent.restore(restored);
         Ok(agent)
@@ -205,7 +179,7 @@ impl Agent {
 
     /// Takes one input.
     pub fn handle(&mut self, now: Instant, input: Input) {
-        self.now = self.now.max(now.min(LATEST));
+        self.context.reach(now);
         match input {
             Input::Keyframe(keyframe) => self.on_keyframe(keyframe),
             Input::Sighting(sighting) => self.on_sighting(&sighting),
@@ -223,7 +197,7 @@ impl Agent {
                 self.save_refusals();
             }
             Input::Command(Command::NewEpoch) => {
-                self.begin_epoch(self.me.frame.epoch.saturating_add(1), EpochReason::Told);
+                self.begin_epoch(self.context.frame().epoch.saturating_add(1), EpochReason::Told);
             }
         }
         self.run_timers();
@@ -236,23 +210,23 @@ impl Agent {
 
     /// The next output, if any. Only [`Agent::handle`] makes new ones.
     pub fn poll_output(&mut self) -> Option<Output> {
-        self.outputs.pop_front()
+        self.context.next_output()
     }
 
     /// When [`Input::Timeout`] is wanted. Only [`Agent::handle`] changes it.
     pub fn poll_timeout(&self) -> Option<Instant> {
-        let further = self.allowance.timeout(self.now);
+        let further = self.allowance.timeout(self.context.now());
         [self.gossip_timeout(), self.fetch_timeout(), self.solve_timeout(), further].into_iter().flatten().min()
     }
 
     /// This robot.
     pub fn robot(&self) -> RobotId {
-        self.me.robot
+        self.context.robot()
     }
 
     /// The frame that this robot writes now.
     pub fn frame(&self) -> FrameId {
-        self.me.frame
+        self.context.frame()
     }
 
     /// What it holds: the lengths of its logs, `None` for those that have two histories.
@@ -289,26 +263,26 @@ impl Agent {
         let loaded = self.replica.restore(entries);
         for [a, b] in forks {
             if let Err(error) = self.replica.ingest_fork(&a, &b) {
-                self.reject(None, "store: fork", &error.to_string());
+                self.context.reject(None, "store: fork", &error.to_string());
             }
         }
-        if let Some(epoch) = self.replica.epochs_of(self.me.robot).next_back() {
-            self.me.frame.epoch = epoch;
+        if let Some(epoch) = self.replica.epochs_of(self.context.robot()).next_back() {
+            self.context.set_epoch(epoch);
         }
-        if self.replica.is_quarantined(self.me.frame) {
-            closed = closed.max(Some(self.me.frame.epoch));
+        if self.replica.is_quarantined(self.context.frame()) {
+            closed = closed.max(Some(self.context.frame().epoch));
         }
         if let Err(damage) = loaded {
-            self.reject(None, "store", &damage.to_string());
-            closed = closed.max(damage.concerns(self.me.frame).then_some(self.me.frame.epoch));
+            self.context.reject(None, "store", &damage.to_string());
+            closed = closed.max(damage.concerns(self.context.frame()).then_some(self.context.frame().epoch));
         }
-        if let Some(closed) = closed.filter(|closed| *closed >= self.me.frame.epoch) {
+        if let Some(closed) = closed.filter(|closed| *closed >= self.context.frame().epoch) {
             self.begin_epoch(closed.saturating_add(1).max(fresh_epoch), EpochReason::Log);
         }
         self.refusals.restore(refused);
         self.relearn();
         // Only now it is known which are ours; of others as many are taken as there is room for.
-        let named = self.knowledge.blobs_of(self.me.robot);
+        let named = self.knowledge.blobs_of(self.context.robot());
         let is_named = |bytes: &&Vec<u8>| named.contains(&Hash::of(bytes));
         let further: Vec<Hash> =
             blobs.iter().filter(is_named).filter_map(|bytes| Keypoints::address_in(bytes)).collect();
@@ -326,7 +300,7 @@ impl Agent {
     fn runs_of(&self, kept: Option<(u32, u64, Vec<u64>)>) -> Runs {
         let Some((epoch, session, over)) = kept else { return Runs::default() };
         // An epoch that began since may be of any run that is not over.
-        Runs::remembered((epoch == self.me.frame.epoch).then_some(session), over)
+        Runs::remembered((epoch == self.context.frame().epoch).then_some(session), over)
     }
 
     /// A durable entry takes effect.
@@ -344,7 +318,7 @@ impl Agent {
                 self.map.dirty = true;
                 self.on_fact(id, &fact);
             }
-            Err(error) => self.reject(Some(id.frame.robot), error.reason(), &format!("{id}: {error}")),
+            Err(error) => self.context.reject(Some(id.frame.robot), error.reason(), &format!("{id}: {error}")),
         }
     }
 
@@ -374,32 +348,6 @@ impl Agent {
             JobResult::Described(described) => self.on_described(id, *described),
             JobResult::Aligned(outcome) => self.on_aligned(id, outcome),
             JobResult::Solved(solved) => self.on_solved(id, *solved),
-        }
-    }
-
-    fn run_job(&mut self, job: Job) -> JobId {
-        let id = JobId(self.next_job);
-        self.next_job += 1;
-        self.stats.worked(job.kind());
-        self.outputs.push_back(Output::Run { id, job });
-        id
-    }
-
-    fn new_query(&mut self) -> QueryId {
-        let id = QueryId(self.next_query);
-        self.next_query += 1;
-        id
-    }
-
-    fn event(&mut self, event: Event) {
-        self.outputs.push_back(Output::Event(event));
-    }
-
-    /// Counts a refusal and reports it, at most once per peer and interval.
-    fn reject(&mut self, peer: Option<RobotId>, reason: &'static str, detail: &str) {
-        if let Some(suppressed) = self.stats.rejected(self.now, peer, reason) {
-            let name = peer.map_or_else(|| "unknown".to_owned(), |peer| self.robot_name(peer));
-            self.event(Event::Rejected { peer, name, reason: format!("{reason}: {detail}"), suppressed });
         }
     }
 }

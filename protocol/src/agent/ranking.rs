@@ -50,7 +50,7 @@ impl Agent {
     /// Candidates worth their cost, best first.
     pub(super) fn active_candidates(&self) -> Vec<Proposal> {
         let stated = self.stated();
-        let enough = MERGE_ATTEMPTS * self.config.estimate.alignments_min;
+        let enough = MERGE_ATTEMPTS * self.context.config().estimate.alignments_min;
         let proposal = |candidate: Candidate| {
             let Candidate { mine, theirs, .. } = candidate;
             let joins = !self.are_connected(mine, theirs) && stated.between(pair_of(mine, theirs)) < enough;
@@ -65,7 +65,7 @@ impl Agent {
 
     /// Active candidates without those that are put off until more may be spent: they are no work left to do.
     pub(super) fn proposals(&self) -> usize {
-        let may_spend = self.allowance.has_some(self.now);
+        let may_spend = self.allowance.has_some(self.context.now());
         let is_begun = |p: &Proposal| self.negotiation.begun.contains(&pair_of(p.mine, p.theirs));
         self.active_candidates().iter().filter(|p| may_spend || !p.may_wait || is_begun(p)).count()
     }
@@ -104,7 +104,7 @@ impl Agent {
         }
         let told = if averages { told(features.apart) } else { 1.0 };
         let limit = if is_loop && averages { part(LOOPS_PER_SUBMAP, told) } else { ALIGNMENTS_PER_SUBMAP };
-        if stated.most_of_either(pair) >= limit.max(self.config.estimate.alignments_min) {
+        if stated.most_of_either(pair) >= limit.max(self.context.config().estimate.alignments_min) {
             return None;
         }
         let lacking = self.blobs_lacking(candidate, stated);

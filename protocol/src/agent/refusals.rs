@@ -79,7 +79,7 @@ impl Refusals {
 impl Agent {
     /// A pair that we tried was refused. One of a submap that went meanwhile cannot be tried again, whatever is known.
     pub(super) fn note_refusal(&mut self, pair: Pair) {
-        let is_gone = |id: SubmapId| id.frame.robot == self.me.robot && self.negotiation.features(id).is_none();
+        let is_gone = |id: SubmapId| id.frame.robot == self.context.robot() && self.negotiation.features(id).is_none();
         if is_gone(pair.0) || is_gone(pair.1) {
             return;
         }
@@ -95,7 +95,7 @@ impl Agent {
         gone.into_iter().for_each(|pair| self.negotiation.retry(pair));
         for &(i, j) in self.refusals.held.keys() {
             // Of a loop, ours is the one that was made later: it was paired up with those before it.
-            let (mine, theirs) = if j.frame.robot == self.me.robot { (j, i) } else { (i, j) };
+            let (mine, theirs) = if j.frame.robot == self.context.robot() { (j, i) } else { (i, j) };
             self.negotiation.restore_tried(mine, theirs);
         }
     }
@@ -108,12 +108,12 @@ impl Agent {
 
     /// Refusals go to the disk with whatever else does now.
     pub(super) fn save_refusals(&mut self) {
-        self.ledger.open.append(&mut self.refusals.waiting);
+        self.refusals.waiting.drain(..).for_each(|record| self.context.keep(record));
     }
 
     /// A digest of what a try of this pair rests on; `None` if it is no pair that we could try.
     fn evidence(&self, (i, j): Pair) -> Option<u64> {
-        if i.frame.robot != self.me.robot && j.frame.robot != self.me.robot {
+        if i.frame.robot != self.context.robot() && j.frame.robot != self.context.robot() {
             return None;
         }
         let blob = |id| self.knowledge.submap(id).map(|known| known.blob);

@@ -112,7 +112,7 @@ impl Agent {
 
     /// The two submaps of another's alignment of one of ours.
     pub(super) fn ours_first(&self, fact: &AlignmentFact) -> (SubmapId, SubmapId) {
-        if fact.i.frame.robot == self.me.robot { (fact.i, fact.j) } else { (fact.j, fact.i) }
+        if fact.i.frame.robot == self.context.robot() { (fact.i, fact.j) } else { (fact.j, fact.i) }
     }
 
     /// Where a submap's keypoints go on, if they do and those that say so are here.
@@ -126,7 +126,7 @@ impl Agent {
 
     /// The addresses of our own blobs: those that facts name, and those that these name.
     pub(super) fn own_blobs(&self) -> BTreeSet<Hash> {
-        self.with_further(self.knowledge.blobs_of(self.me.robot))
+        self.with_further(self.knowledge.blobs_of(self.context.robot()))
     }
 
     /// These blobs, and those that go on with them as far as they are here to say so.

@@ -95,8 +95,8 @@ impl Agent {
         }
         match self.sighting_fact(sighting) {
             Ok(Fact::Position(fact)) => self.state_position(fact),
-            Ok(fact) => _ = self.write(self.me.frame.epoch, &fact),
-            Err(detail) => self.reject(Some(self.me.robot), "sighting", detail),
+            Ok(fact) => _ = self.write(self.context.frame().epoch, &fact),
+            Err(detail) => self.context.reject(Some(self.context.robot()), "sighting", detail),
         }
     }
 
@@ -107,7 +107,7 @@ impl Agent {
         }
         match self.position_fact(sighting) {
             Ok(fact) => self.state_position(fact),
-            Err(detail) => self.reject(Some(self.me.robot), "position", detail),
+            Err(detail) => self.context.reject(Some(self.context.robot()), "position", detail),
         }
     }
 
@@ -118,7 +118,7 @@ impl Agent {
 
     /// States a position, unless it is no news: sensors see a robot many times a second.
     fn state_position(&mut self, fact: PositionFact) {
-        if self.positions.is_news(&fact) && self.write(self.me.frame.epoch, &Fact::Position(fact.clone())) {
+        if self.positions.is_news(&fact) && self.write(self.context.frame().epoch, &Fact::Position(fact.clone())) {
             self.positions.note(&fact);
         }
     }
@@ -126,12 +126,12 @@ impl Agent {
     /// Whether nothing can be stated now; if so it is refused under one of these names.
     fn is_hindered(&mut self, receive_only: &'static str, overload: &'static str) -> bool {
         if self.is_receive_only() {
-            self.reject(Some(self.me.robot), receive_only, "it cannot be kept now");
+            self.context.reject(Some(self.context.robot()), receive_only, "it cannot be kept now");
             return true;
         }
         if self.is_overloaded() {
             let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk; the store is too slow");
-            self.reject(Some(self.me.robot), overload, &detail);
+            self.context.reject(Some(self.context.robot()), overload, &detail);
             return true;
         }
         false
@@ -152,8 +152,8 @@ impl Agent {
 
     /// Where we were at `stamp`, and the robot of that name.
     fn meeting(&self, robot: &Name, stamp: Stamp) -> Result<Meeting, &'static str> {
-        let seen = self.replica.members().find(|(_, name)| *name == robot).map(|(id, _)| id);
-        let seen = seen.filter(|id| *id != self.me.robot).ok_or("names no other robot of the roster")?;
+        let seen = self.context.robot_named(robot);
+        let seen = seen.filter(|id| *id != self.context.robot()).ok_or("names no other robot of the roster")?;
         let (index, t_i_body, at) = self.mapper.body().ok_or("came before the first submap was finished")?;
         let own_age = stamp.secs_since(at);
         if own_age.abs() > SIGHTING_AGE_SECS_MAX {
@@ -162,12 +162,12 @@ impl Agent {
             );
         }
         let beacon = self.gossip.beacon(seen).ok_or("names a robot of which no pose beacon was heard yet")?;
-        let age = self.now.since(beacon.since).as_secs_f64();
+        let age = self.context.now().since(beacon.since).as_secs_f64();
         if age > SIGHTING_AGE_SECS_MAX {
             return Err("names a robot whose last keyframe is too old, by its beacons; lower its gossip.pose_secs");
         }
         Ok(Meeting {
-            i: SubmapId { frame: self.me.frame, index },
+            i: SubmapId { frame: self.context.frame(), index },
             j: beacon.content.anchor,
             t_i_body: moved_on(&t_i_body, self.mapper.twist(), own_age, 0.0),
             t_j_other: moved_on(&beacon.content.t_anchor_body, beacon.twist, age, LATE_SIGMA_SECS),

@@ -48,9 +48,9 @@ impl Agent {
     }
 
     pub(super) fn start_solving(&mut self) {
-        if self.map.dirty && self.map.solving.is_none() && self.now >= self.map.next_solve {
-            let config = self.config.estimate.clone();
-            let own = self.me.frame;
+        if self.map.dirty && self.map.solving.is_none() && self.context.now() >= self.map.next_solve {
+            let config = self.context.config().estimate.clone();
+            let own = self.context.frame();
             let mut steps = core::mem::take(&mut self.map.steps).renewed();
             let odometry = |known: &Known| steps.of(known, || self.submap_fact(known).map(|fact| fact.odometry));
             let EstimationInput { problem, alone, gaps } = self.knowledge.question(own, odometry);
@@ -59,10 +59,11 @@ impl Agent {
             let job = SolveJob { problem, config, own, live };
             (self.map.posed_from, self.map.posed_alone, self.map.posed_gaps) = (Some(own), alone, gaps);
             self.map.dirty = false;
-            self.map.posed_at = self.now;
+            self.map.posed_at = self.context.now();
             self.map.posed_digest = self.replica.digest();
-            self.map.next_solve = self.now.after(Duration::from_secs_f64(self.config.estimate.interval_secs));
-            self.map.solving = Some(self.run_job(Job::Solve(Box::new(job))));
+            self.map.next_solve =
+                self.context.now().after(Duration::from_secs_f64(self.context.config().estimate.interval_secs));
+            self.map.solving = Some(self.context.run_job(Job::Solve(Box::new(job))));
         }
     }
 
@@ -70,8 +71,8 @@ impl Agent {
         if self.map.solving.take_if(|running| *running == job).is_none() {
             return;
         }
-        let rest = self.now.since(self.map.posed_at).saturating_mul(REST).min(REST_MAX);
-        self.map.next_solve = self.map.next_solve.max(self.now.after(rest));
+        let rest = self.context.now().since(self.map.posed_at).saturating_mul(REST).min(REST_MAX);
+        self.map.next_solve = self.map.next_solve.max(self.context.now().after(rest));
         self.map.digest = self.map.posed_digest;
         self.map.seen_from = self.map.posed_from;
         self.map.alone = core::mem::take(&mut self.map.posed_alone);
@@ -80,16 +81,16 @@ impl Agent {
         self.negotiation.mark_dirty();
         let before = core::mem::replace(&mut self.map.merged, merged.clone());
         for frame in merged.difference(&before) {
-            self.event(Event::Merged { frame: *frame });
+            self.context.event(Event::Merged { frame: *frame });
         }
         for frame in before.difference(&merged) {
-            self.event(Event::Unmerged { frame: *frame });
+            self.context.event(Event::Unmerged { frame: *frame });
         }
     }
 
     /// Frames in the component of our present frame, without it.
     pub(super) fn frames_merged_with_ours(&self) -> BTreeSet<FrameId> {
-        let own = self.me.frame;
+        let own = self.context.frame();
         let Some(ours) = self.map.solved.frames.get(&own).map(|placed| placed.with) else { return BTreeSet::new() };
         let together = self.map.solved.frames.iter().filter(|(frame, placed)| **frame != own && placed.with == ours);
         together.map(|(frame, _)| *frame).collect()
@@ -117,7 +118,7 @@ impl Agent {
     }
 
     fn solved_for_own(&self) -> Option<&Solved> {
-        (self.map.seen_from == Some(self.me.frame)).then_some(&self.map.solved)
+        (self.map.seen_from == Some(self.context.frame())).then_some(&self.map.solved)
     }
 
     /// A submap's fact, from the entry that holds it now.

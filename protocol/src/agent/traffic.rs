@@ -65,36 +65,36 @@ impl Agent {
     /// Broadcasts.
     pub(super) fn publish(&mut self, channel: Channel, message: &Message) {
         let bytes = self.pay_for(message);
-        self.outputs.push_back(Output::Publish { channel, bytes });
+        self.context.put(Output::Publish { channel, bytes });
     }
 
     /// The bytes of a message that goes out, counted and paid.
     pub(super) fn pay_for(&mut self, message: &Message) -> Vec<u8> {
         let bytes = self.count(message);
-        self.gossip.traffic.budget.pay(self.now, bytes.len());
+        self.gossip.traffic.budget.pay(self.context.now(), bytes.len());
         bytes
     }
 
     /// The same for an answer, which takes nothing from the classes above its own.
     pub(super) fn pay_for_answer(&mut self, class: Class, message: &Message) -> Vec<u8> {
         let bytes = self.count(message);
-        self.gossip.traffic.budget.pay_answer(self.now, class, bytes.len());
+        self.gossip.traffic.budget.pay_answer(self.context.now(), class, bytes.len());
         bytes
     }
 
     fn count(&mut self, message: &Message) -> Vec<u8> {
         let bytes = message.encode();
-        self.stats.sent(message.kind(), bytes.len());
+        self.context.count().sent(message.kind(), bytes.len());
         bytes
     }
 
     /// Whether to announce, ask or negotiate now. If not, a turn is held back: one each time that the link is full.
     pub(super) fn may_speak(&mut self) -> bool {
         let Traffic { budget, held_until, .. } = &mut self.gossip.traffic;
-        let may = budget.may(self.now, Class::Have);
-        if !may && *held_until <= self.now {
-            *held_until = budget.due(self.now, Class::Have);
-            self.stats.held_back(Class::Have, 1);
+        let may = budget.may(self.context.now(), Class::Have);
+        if !may && *held_until <= self.context.now() {
+            *held_until = budget.due(self.context.now(), Class::Have);
+            self.context.count().held_back(Class::Have, 1);
         }
         may
     }
@@ -108,7 +108,7 @@ impl Agent {
         // Repair brings the others; the latest are the most wanted.
         unsent.drain(..unsent.len().saturating_sub(UNSENT_MAX));
         if held > 0 {
-            self.stats.held_back(Class::Facts, held);
+            self.context.count().held_back(Class::Facts, held);
         }
     }
 
@@ -117,7 +117,7 @@ impl Agent {
         if self.is_alone() {
             return self.gossip.traffic.unsent.clear(); // Nobody listens; whoever comes will sync.
         }
-        while !self.gossip.traffic.unsent.is_empty() && self.gossip.traffic.may(self.now, Class::Facts) {
+        while !self.gossip.traffic.unsent.is_empty() && self.gossip.traffic.may(self.context.now(), Class::Facts) {
             let entries = self.next_unsent();
             for message in Message::facts(entries) {
                 self.publish(Channel::Facts, &message);
@@ -128,7 +128,7 @@ impl Agent {
     /// The entries that go next: one at least, and as many as there is room for.
     fn next_unsent(&mut self) -> Vec<Vec<u8>> {
         let Traffic { budget, unsent, .. } = &mut self.gossip.traffic;
-        let mut left = budget.left(self.now, Class::Facts);
+        let mut left = budget.left(self.context.now(), Class::Facts);
         let mut entries = Vec::new();
         while let Some(id) = unsent.front() {
             // One that a floor has replaced meanwhile is gone.
@@ -147,12 +147,13 @@ impl Agent {
     /// What the holder of `have` lacks, as much of it as there is room for. If there is no room for what is there, the
     /// answer says that there is more, and holds nothing: it is asked for again.
     pub(super) fn repair(&mut self, have: &Have) -> Delta {
-        let left = self.gossip.traffic.budget.left(self.now, Class::Repair);
-        let delta = self.replica.delta_for(have, left.max(REPAIR_BYTES_MIN).min(self.config.gossip.delta_bytes_max));
+        let left = self.gossip.traffic.budget.left(self.context.now(), Class::Repair);
+        let delta =
+            self.replica.delta_for(have, left.max(REPAIR_BYTES_MIN).min(self.context.config().gossip.delta_bytes_max));
         if left >= REPAIR_BYTES_MIN || carried_by(&delta) <= left {
             return delta;
         }
-        self.stats.held_back(Class::Repair, 1);
+        self.context.count().held_back(Class::Repair, 1);
         Delta { more: true, ..Delta::default() }
     }
 
@@ -160,12 +161,12 @@ impl Agent {
     pub(super) fn piece(&mut self, hash: Hash, offset: usize, len: usize) -> Option<Message> {
         let blob = self.gossip.blob(hash)?;
         let asked = blob.get(offset..offset.saturating_add(len).min(blob.len()))?; // Beyond its end there is nothing.
-        let left = self.gossip.traffic.budget.left(self.now, Class::Blob);
+        let left = self.gossip.traffic.budget.left(self.context.now(), Class::Blob);
         let fits = left >= PIECE_BYTES_MIN || asked.len() <= left;
         let bytes = if fits { asked[..asked.len().min(left)].to_vec() } else { Vec::new() };
         let total = blob.len() as u32;
         if !fits {
-            self.stats.held_back(Class::Blob, 1);
+            self.context.count().held_back(Class::Blob, 1);
         }
         Some(Message::BlobReply { hash, offset: offset as u32, total, bytes })
     }
@@ -179,12 +180,12 @@ impl Agent {
         *times += 1;
         if *times > POSTPONED_MAX {
             traffic.postponed.remove(&hash);
-            return self.negotiation.fetch_failed(query, self.now);
+            return self.negotiation.fetch_failed(query, self.context.now());
         }
         let pause = POSTPONED_PAUSE * 2u32.pow((*times - 1).min(POSTPONED_DOUBLINGS));
         if let Some(fetch) = self.negotiation.fetches.get_mut(&hash) {
             fetch.query = None;
-            fetch.not_before = self.now.after(pause);
+            fetch.not_before = self.context.now().after(pause);
         }
     }
 }
@@ -244,7 +245,7 @@ mod tests {
             let (mut agent, ids) = starved((UNSENT_MAX + excess) as u32);
             agent.publish_entries(&ids);
             assert!(published(&mut agent).is_empty());
-            assert_eq!(agent.stats.held_back["facts"], ids.len() as u64);
+            assert_eq!(agent.context.stats().held_back["facts"], ids.len() as u64);
             let mut came = Vec::new();
             let mut messages = 0;
             while came.len() < UNSENT_MAX {

@@ -7,7 +7,7 @@ use crate::estimate::EdgeKind;
 use crate::estimate::joint::Shortfall;
 use crate::estimate::solve::SolveError;
 use crate::geometry::Se3;
-use crate::ids::{EntryId, FrameId, RobotId, SubmapId};
+use crate::ids::{EntryId, FrameId, RobotId};
 use crate::snapshot::{
     CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, PairView, PoseView, PosesView,
     RelationView, Snapshot, StatsView, StatusView, SubmapView,
@@ -39,14 +39,14 @@ impl Agent {
         let pending = self.pending();
         let settled = !self.map.dirty && self.map.solving.is_none() && self.map.digest == self.replica.digest();
         StatusView {
-            swarm: self.me.swarm.to_string(),
-            robot: self.me.name.to_string(),
-            id: self.me.robot.to_string(),
-            epoch: self.me.frame.epoch,
-            neighbours: self.gossip.spread.neighbours().map(|robot| self.robot_name(robot)).collect(),
+            swarm: self.context.me().swarm.to_string(),
+            robot: self.context.me().name.to_string(),
+            id: self.context.robot().to_string(),
+            epoch: self.context.frame().epoch,
+            neighbours: self.gossip.spread.neighbours().map(|robot| self.context.robot_name(robot)).collect(),
             entries: self.replica.held(),
             digest: self.replica.digest().to_string(),
-            estimate: super::estimate_version::fingerprint(&self.config.estimate),
+            estimate: super::estimate_version::fingerprint(&self.context.config().estimate),
             submaps: self.negotiation.own().count() as u64,
             keyframes: self.mapper.keyframes,
             pending,
@@ -66,13 +66,13 @@ impl Agent {
 
     /// What a restart now would lose.
     pub(super) fn unsaved(&self) -> u64 {
-        (self.ledger.waiting.len() + self.ledger.open.len() + self.mapper.pending()) as u64
+        (self.ledger.waiting.len() + self.context.kept() + self.mapper.pending()) as u64
     }
 
     fn merged_with(&self) -> Vec<String> {
         let robots: BTreeSet<RobotId> = self.frames_merged_with_ours().iter().map(|f| f.robot).collect();
         let mut names: Vec<String> =
-            robots.into_iter().filter(|r| *r != self.me.robot).map(|r| self.robot_name(r)).collect();
+            robots.into_iter().filter(|r| *r != self.context.robot()).map(|r| self.context.robot_name(r)).collect();
         names.sort();
         names
     }
@@ -86,14 +86,14 @@ impl Agent {
         let frames = submaps
             .into_iter()
             .map(|(frame, submaps)| FrameView {
-                frame: self.frame_name(frame),
-                robot: self.robot_name(frame.robot),
+                frame: self.context.frame_name(frame),
+                robot: self.context.robot_name(frame.robot),
                 submaps,
                 component: components.get(&frame).map_or(u64::MAX, |number| *number),
                 t_own_frame: self.t_own_frame(frame).as_ref().map(RelationView::from),
             })
             .collect();
-        FramesView { own: self.frame_name(self.me.frame), frames, pairs: self.pair_views() }
+        FramesView { own: self.context.frame_name(self.context.frame()), frames, pairs: self.pair_views() }
     }
 
     /// Numbers the components by their smallest frames; frames with one number are connected.
@@ -114,8 +114,8 @@ impl Agent {
         let pairs = self.map.solved.pairs.iter();
         pairs
             .map(|pair| PairView {
-                a: self.frame_name(pair.a),
-                b: self.frame_name(pair.b),
+                a: self.context.frame_name(pair.a),
+                b: self.context.frame_name(pair.b),
                 status: pair.status,
                 proposed: proposed.get(&(pair.a, pair.b)).copied().unwrap_or(0),
                 agreed: pair.agreed as u64,
@@ -141,8 +141,8 @@ impl Agent {
             }
             t_frame_anchor = t_frame_anchor * fact.t_prev_this;
             submaps.push(SubmapView {
-                frame: self.frame_name(id.frame),
-                robot: self.robot_name(id.frame.robot),
+                frame: self.context.frame_name(id.frame),
+                robot: self.context.robot_name(id.frame.robot),
                 index: id.index,
                 stamps_secs: fact.stamps.map(crate::time::Stamp::as_secs_f64),
                 t_frame_anchor: PoseView::from(&t_frame_anchor),
@@ -166,8 +166,8 @@ impl Agent {
                     EdgeKind::Position => "position",
                 }
                 .to_string(),
-                i: self.submap_name(measurement.i),
-                j: self.submap_name(measurement.j),
+                i: self.context.submap_name(measurement.i),
+                j: self.context.submap_name(measurement.j),
                 t_i_j: RelationView::from(&measurement.t_i_j),
                 agreed: true,
                 weight: edge.weight,
@@ -176,7 +176,7 @@ impl Agent {
         }
         edges.extend(self.unused_edges(&listed));
         let failed = |(frames, why): &(Vec<FrameId>, Shortfall)| FailedView {
-            frames: frames.iter().map(|frame| self.frame_name(*frame)).collect(),
+            frames: frames.iter().map(|frame| self.context.frame_name(*frame)).collect(),
             reason: self.shortfall(why),
         };
         let nodes = solved.nodes + self.map.alone.values().sum::<usize>();
@@ -196,10 +196,10 @@ impl Agent {
         let text = why.to_string();
         match why {
             Shortfall::Unsolved(SolveError::UnderconstrainedAnchor(id)) => {
-                text.replace(&id.to_string(), &self.submap_name(*id))
+                text.replace(&id.to_string(), &self.context.submap_name(*id))
             }
             Shortfall::Unsolved(SolveError::UnderconstrainedScale(frame)) => {
-                text.replace(&frame.to_string(), &self.frame_name(*frame))
+                text.replace(&frame.to_string(), &self.context.frame_name(*frame))
             }
             _ => text,
         }
@@ -213,8 +213,8 @@ impl Agent {
                 let agreement = self.knowledge.agreement(id);
                 EdgeView {
                     kind: "alignment".to_string(),
-                    i: self.submap_name(fact.i),
-                    j: self.submap_name(fact.j),
+                    i: self.context.submap_name(fact.i),
+                    j: self.context.submap_name(fact.j),
                     t_i_j: RelationView::from(&fact.t_i_j),
                     agreed: agreement == Agreement::Agreed,
                     weight: 0.0,
@@ -241,7 +241,7 @@ impl Agent {
     }
 
     fn stats_view(&self) -> StatsView {
-        let stats = &self.stats;
+        let stats = self.context.stats();
         let bytes = |table: &BTreeMap<&'static str, (u64, u64)>| {
             table.iter().map(|(kind, (bytes, _))| ((*kind).to_string(), *bytes)).collect()
         };
@@ -251,7 +251,8 @@ impl Agent {
         let counts = |table: &BTreeMap<&'static str, u64>| {
             table.iter().map(|(kind, count)| ((*kind).to_string(), *count)).collect()
         };
-        let peer_name = |peer: &Option<RobotId>| peer.map_or_else(|| "unknown".to_string(), |p| self.robot_name(p));
+        let peer_name =
+            |peer: &Option<RobotId>| peer.map_or_else(|| "unknown".to_string(), |p| self.context.robot_name(p));
         StatsView {
             sent_bytes: bytes(&stats.sent),
             sent_messages: messages(&stats.sent),
@@ -263,18 +264,5 @@ impl Agent {
             held_back: counts(&stats.held_back),
             condensed_bytes: CondensedView { before: stats.condensed_bytes[0], after: stats.condensed_bytes[1] },
         }
-    }
-
-    /// A robot's name, or its id if the roster does not hold it.
-    pub(super) fn robot_name(&self, robot: RobotId) -> String {
-        self.replica.name_of(robot).map_or_else(|| robot.to_string(), ToString::to_string)
-    }
-
-    fn frame_name(&self, frame: FrameId) -> String {
-        format!("{}/{}", self.robot_name(frame.robot), frame.epoch)
-    }
-
-    pub(super) fn submap_name(&self, id: SubmapId) -> String {
-        format!("{}#{}", self.frame_name(id.frame), id.index)
     }
 }
