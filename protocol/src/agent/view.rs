@@ -2,7 +2,9 @@
 //! [`crate::snapshot`]).
 
 use super::Agent;
-use super::knowledge::Agreement;
+use super::alignment::Sources;
+use super::estimation::{estimate_version, live, pair_views, robot_view};
+use super::replication::knowledge::Agreement;
 use crate::estimate::EdgeKind;
 use crate::estimate::joint::Shortfall;
 use crate::estimate::solve::SolveError;
@@ -37,40 +39,51 @@ impl Agent {
     /// `view/status` alone: cheap enough to ask often.
     pub fn status(&self) -> StatusView {
         let pending = self.pending();
-        let settled = !self.map.dirty && self.map.solving.is_none() && self.map.digest == self.replica.digest();
+        let settled = self.estimation.is_settled(self.replication.digest());
         StatusView {
             swarm: self.context.me().swarm.to_string(),
             robot: self.context.me().name.to_string(),
             id: self.context.robot().to_string(),
             epoch: self.context.frame().epoch,
-            neighbours: self.gossip.spread.neighbours().map(|robot| self.context.robot_name(robot)).collect(),
-            entries: self.replica.held(),
-            digest: self.replica.digest().to_string(),
-            estimate: super::estimate_version::fingerprint(&self.context.config().estimate),
-            submaps: self.negotiation.own().count() as u64,
-            keyframes: self.mapper.keyframes,
+            neighbours: self.replication.neighbours().map(|robot| self.context.robot_name(robot)).collect(),
+            entries: self.replication.held(),
+            digest: self.replication.digest().to_string(),
+            estimate: estimate_version::fingerprint(&self.context.config().estimate),
+            submaps: self.alignment.own_submaps() as u64,
+            keyframes: self.mapping.keyframes(),
             pending,
             unsaved: self.unsaved(),
             idle: pending == 0 && settled,
             merged_with: self.merged_with(),
-            receive_only: self.is_receive_only(),
+            receive_only: self.replication.is_receive_only(&self.context),
         }
     }
 
     /// Work that this robot still has to do with the facts it holds.
     fn pending(&self) -> u64 {
         // A robot at its epoch limit writes no facts that others would accept, so verdicts and proposals do not count.
-        let open = if self.epoch_limit().is_some() { 0 } else { self.answers_owed().len() + self.proposals() };
-        self.unsaved() + (self.negotiation.running.len() + open) as u64
+        let sources = Sources::of(&self.replication, &self.estimation);
+        let owed = || self.alignment.answers_owed(&self.context, sources).len();
+        let open = match self.replication.epoch_limit(&self.context) {
+            Some(_) => 0,
+            None => owed() + self.alignment.proposals(&self.context, sources),
+        };
+        self.unsaved() + (self.alignment.running() + open) as u64
+    }
+
+    /// Something is on its way to the disk, and the disk takes it: an end now would lose what a moment would save.
+    pub fn is_saving(&self) -> bool {
+        self.unsaved() > 0 && !self.replication.store_fails()
     }
 
     /// What a restart now would lose.
-    pub(super) fn unsaved(&self) -> u64 {
-        (self.ledger.waiting.len() + self.context.kept() + self.mapper.pending()) as u64
+    fn unsaved(&self) -> u64 {
+        (self.replication.waiting() + self.context.kept() + self.mapping.pending()) as u64
     }
 
     fn merged_with(&self) -> Vec<String> {
-        let robots: BTreeSet<RobotId> = self.frames_merged_with_ours().iter().map(|f| f.robot).collect();
+        let robots: BTreeSet<RobotId> =
+            self.estimation.frames_merged_with(self.context.frame()).iter().map(|f| f.robot).collect();
         let mut names: Vec<String> =
             robots.into_iter().filter(|r| *r != self.context.robot()).map(|r| self.context.robot_name(r)).collect();
         names.sort();
@@ -79,10 +92,10 @@ impl Agent {
 
     fn frames_view(&self) -> FramesView {
         let mut submaps: BTreeMap<FrameId, u64> = BTreeMap::new();
-        for (id, _) in self.knowledge.submaps() {
+        for (id, _) in self.replication.knowledge().submaps() {
             *submaps.entry(id.frame).or_default() += 1;
         }
-        let components = self.components();
+        let (own, components) = (self.context.frame(), self.components());
         let frames = submaps
             .into_iter()
             .map(|(frame, submaps)| FrameView {
@@ -90,17 +103,17 @@ impl Agent {
                 robot: self.context.robot_name(frame.robot),
                 submaps,
                 component: components.get(&frame).map_or(u64::MAX, |number| *number),
-                t_own_frame: self.t_own_frame(frame).as_ref().map(RelationView::from),
+                t_own_frame: self.estimation.t_own_frame(own, frame).as_ref().map(RelationView::from),
             })
             .collect();
-        FramesView { own: self.context.frame_name(self.context.frame()), frames, pairs: self.pair_views() }
+        FramesView { own: self.context.frame_name(own), frames, pairs: self.pair_views() }
     }
 
     /// Numbers the components by their smallest frames; frames with one number are connected.
     fn components(&self) -> BTreeMap<FrameId, u64> {
-        let alone = self.map.alone.keys().map(|frame| (*frame, *frame));
+        let alone = self.estimation.alone().keys().map(|frame| (*frame, *frame));
         let with: BTreeMap<FrameId, FrameId> =
-            self.map.solved.frames.iter().map(|(frame, placed)| (*frame, placed.with)).chain(alone).collect();
+            self.estimation.solved().frames.iter().map(|(frame, placed)| (*frame, placed.with)).chain(alone).collect();
         let smallest: BTreeSet<FrameId> = with.values().copied().collect();
         let numbers: BTreeMap<FrameId, u64> = smallest.into_iter().zip(0..).collect();
         with.into_iter().filter_map(|(frame, with)| Some((frame, *numbers.get(&with)?))).collect()
@@ -108,10 +121,10 @@ impl Agent {
 
     fn pair_views(&self) -> Vec<PairView> {
         let mut proposed: BTreeMap<(FrameId, FrameId), u64> = BTreeMap::new();
-        for (_, fact) in self.knowledge.alignments() {
+        for (_, fact) in self.replication.knowledge().alignments() {
             *proposed.entry((fact.i.frame, fact.j.frame)).or_default() += 1;
         }
-        let pairs = self.map.solved.pairs.iter();
+        let pairs = self.estimation.solved().pairs.iter();
         pairs
             .map(|pair| PairView {
                 a: self.context.frame_name(pair.a),
@@ -127,15 +140,17 @@ impl Agent {
     }
 
     fn poses_view(&self, now: Instant) -> PosesView {
-        let live = self.live(now);
-        PosesView { robots: live.iter().map(|one| self.robot_view(one)).collect(), pairs: self.pairs_of(&live) }
+        let live = live(&self.context, self.mapping.body(), self.replication.beacons(), now);
+        let robots = live.iter().map(|one| robot_view(&self.context, &self.estimation, one)).collect();
+        PosesView { robots, pairs: pair_views(&self.context, &self.estimation, &live) }
     }
 
     fn map_view(&self) -> MapView {
+        let own = self.context.frame();
         let mut submaps = Vec::new();
         let mut t_frame_anchor = Se3::identity();
         let mut frame = None;
-        for (id, fact) in self.knowledge.submaps() {
+        for (id, fact) in self.replication.knowledge().submaps() {
             if frame.replace(id.frame) != Some(id.frame) {
                 t_frame_anchor = Se3::identity();
             }
@@ -146,14 +161,14 @@ impl Agent {
                 index: id.index,
                 stamps_secs: fact.stamps.map(crate::time::Stamp::as_secs_f64),
                 t_frame_anchor: PoseView::from(&t_frame_anchor),
-                t_own_anchor: self.t_own_anchor(id).map(RelationView::from),
+                t_own_anchor: self.estimation.t_own_anchor(own, id).map(RelationView::from),
             });
         }
         MapView { submaps }
     }
 
     fn graph_view(&self) -> GraphView {
-        let solved = &self.map.solved;
+        let solved = self.estimation.solved();
         let mut edges = Vec::new();
         let mut listed = BTreeSet::new();
         for edge in &solved.edges {
@@ -179,7 +194,7 @@ impl Agent {
             frames: frames.iter().map(|frame| self.context.frame_name(*frame)).collect(),
             reason: self.shortfall(why),
         };
-        let nodes = solved.nodes + self.map.alone.values().sum::<usize>();
+        let nodes = solved.nodes + self.estimation.alone().values().sum::<usize>();
         GraphView {
             nodes: nodes as u64,
             chi2: solved.chi2,
@@ -207,10 +222,10 @@ impl Agent {
 
     /// Alignments that did not enter the estimate, with the reason.
     fn unused_edges(&self, listed: &BTreeSet<EntryId>) -> Vec<EdgeView> {
-        let unused = self.knowledge.alignments().filter(|(id, _)| !listed.contains(id));
+        let unused = self.replication.knowledge().alignments().filter(|(id, _)| !listed.contains(id));
         unused
             .map(|(id, fact)| {
-                let agreement = self.knowledge.agreement(id);
+                let agreement = self.replication.knowledge().agreement(id);
                 EdgeView {
                     kind: "alignment".to_string(),
                     i: self.context.submap_name(fact.i),
@@ -226,8 +241,8 @@ impl Agent {
 
     /// Why an alignment is not among those that the estimate was made of.
     fn reason_outside(&self, id: EntryId, fact: &AlignmentFact, agreement: Agreement) -> String {
-        let is_of_present_facts = self.map.digest == self.replica.digest();
-        match (agreement, self.knowledge.counted((fact.i, fact.j))) {
+        let is_of_present_facts = self.estimation.is_of(self.replication.digest());
+        match (agreement, self.replication.knowledge().counted((fact.i, fact.j))) {
             (Agreement::Waiting, _) => "the other endpoint has not answered".to_string(),
             (Agreement::Disputed, _) => "the other endpoint does not agree".to_string(),
             (Agreement::Agreed, Some(first)) if first != id => {

@@ -3,15 +3,17 @@
 //! A beacon states the stamp of its keyframe on its sender's own clock. The beacon of a robot that took the least time
 //! from its keyframe to us tells how the two clocks differ, up to that least time; how late the others were follows.
 
-use super::sighting::Twist;
+use crate::agent::motion::Twist;
+use crate::ids::RobotId;
 use crate::time::Instant;
 use crate::wire::BeaconContent;
 use core::time::Duration;
+use std::collections::BTreeMap;
 
 /// What even the fastest beacon takes from the sensor through SLAM, agent and radio, s, and its standard deviation.
 const LATE_SECS: f64 = 0.1;
 /// Standard deviation of when a keyframe was, s.
-pub(super) const LATE_SIGMA_SECS: f64 = 0.15;
+pub(in crate::agent) const LATE_SIGMA_SECS: f64 = 0.15;
 /// What looks later than this, s, tells that the other's clock was set.
 const LATE_SECS_MAX: f64 = 5.0;
 /// Clocks run away from one another by so much of the time at most.
@@ -19,20 +21,48 @@ const CLOCK_DRIFT: f64 = 1e-4;
 
 /// The latest beacon of a robot.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct SeenBeacon {
-    pub(super) content: BeaconContent,
-    pub(super) at: Instant,
+pub(in crate::agent) struct SeenBeacon {
+    pub(in crate::agent) content: BeaconContent,
+    pub(in crate::agent) at: Instant,
     /// When the keyframe was that it tells of: the robot may have moved since, and had no other.
-    pub(super) since: Instant,
+    pub(in crate::agent) since: Instant,
     /// How the body moves, as far as this one and those before it tell.
-    pub(super) twist: Option<Twist>,
+    pub(in crate::agent) twist: Option<Twist>,
     /// The least by which our clock was ahead of the stamp when a keyframe was first heard of, ns.
     ahead: i64,
 }
 
+/// The latest beacon of every robot that was heard.
+#[derive(Default)]
+pub(in crate::agent) struct Beacons(BTreeMap<RobotId, SeenBeacon>);
+
+impl Beacons {
+    /// Takes a beacon of another robot, if it is newer than the one at hand.
+    pub(super) fn hear(&mut self, content: BeaconContent, now: Instant) {
+        let robot = content.anchor.frame.robot;
+        let before = self.0.get(&robot);
+        // The counter begins anew with the process, the stamps of one epoch do not.
+        let age = |content: &BeaconContent| (content.anchor.frame.epoch, content.stamp, content.counter);
+        if before.is_none_or(|seen| age(&content) > age(&seen.content)) {
+            let seen = SeenBeacon::after(before, content, now);
+            self.0.insert(robot, seen);
+        }
+    }
+
+    /// The latest of one robot.
+    pub(in crate::agent) fn of(&self, robot: RobotId) -> Option<&SeenBeacon> {
+        self.0.get(&robot)
+    }
+
+    /// The latest of each, by robot.
+    pub(in crate::agent) fn iter(&self) -> impl Iterator<Item = (RobotId, &SeenBeacon)> {
+        self.0.iter().map(|(robot, seen)| (*robot, seen))
+    }
+}
+
 impl SeenBeacon {
     /// `content`, heard at `at`, after what was heard before.
-    pub(super) fn after(before: Option<&Self>, content: BeaconContent, at: Instant) -> Self {
+    fn after(before: Option<&Self>, content: BeaconContent, at: Instant) -> Self {
         let ahead = at.as_nanos().cast_signed().saturating_sub(content.stamp.0);
         let new = Self { content, at, since: earlier(at, LATE_SECS), twist: None, ahead };
         let Some(old) = before.filter(|old| old.content.anchor.frame == content.anchor.frame) else { return new };

@@ -1,7 +1,7 @@
 //! How much has been stated already of two frames and of their submaps: when one alignment more would say too little.
 
-use super::knowledge::Pair;
 use super::negotiation::ALIGNMENTS_PER_FRAME_PAIR;
+use crate::agent::replication::knowledge::Pair;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use std::collections::BTreeMap;

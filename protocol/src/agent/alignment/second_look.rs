@@ -8,19 +8,17 @@
 //! connects two frames, more keypoints find hardly a true pair more, and sooner a false one.) After a restart what was
 //! refused stays refused.
 
-use super::Agent;
-use super::knowledge::pair_of;
+use super::Prospects;
 use super::negotiation::Work;
 use super::overlap_model::Prediction;
 use super::ranking::DRIFT_SIGMAS;
 use super::shortlist::Candidate;
-use super::two_sided;
+use crate::agent::replication::knowledge::pair_of;
+use crate::agent::replication::two_sided;
 use crate::geometry::Relative;
 use crate::ids::{Hash, SubmapId};
 use crate::submap::Keypoints;
 use crate::wire::fact::{AlignmentFact, RefusalReason};
-use std::collections::BTreeSet;
-use std::sync::Arc;
 
 /// Pairs that wait for a second look at most; of more, the least alike go.
 pub const SECOND_LOOKS_MAX: usize = 1_024;
@@ -33,18 +31,17 @@ const OFF_MAX: f64 = 0.1;
 /// What a second look is worth of a first one that promises as much: it is had when there is nothing better to do.
 pub(super) const WORTH: f64 = 0.1;
 
-impl Agent {
-    /// A first look at a pair found too little. More keypoints may help, if there are any.
-    pub(super) fn note_second_look(&mut self, work: &Work, prediction: Prediction, reason: RefusalReason) {
+impl Prospects<'_> {
+    /// A first look at a pair found too little. More keypoints may help, if there are any: then it may be looked at
+    /// again.
+    pub(super) fn second_look(&self, work: &Work, prediction: Prediction, reason: RefusalReason) -> Option<Candidate> {
         let too_little = match reason {
             RefusalReason::TooFew | RefusalReason::NoConsensus | RefusalReason::PoorFit => true,
             RefusalReason::Ambiguous | RefusalReason::Degenerate | RefusalReason::BadInput => false,
         };
-        if too_little && work.further.is_none() && self.address_of(work.theirs).is_some() {
-            let (mine, theirs, similarity) = (work.mine, work.theirs, prediction.features.similarity);
-            let candidate = Candidate { mine, theirs, similarity, wished: false, further: true };
-            self.negotiation.add_second_look(candidate);
-        }
+        let may_help = too_little && work.further.is_none() && self.address_of(work.theirs).is_some();
+        let (mine, theirs, similarity) = (work.mine, work.theirs, prediction.features.similarity);
+        may_help.then_some(Candidate { mine, theirs, similarity, wished: false, further: true })
     }
 
     /// Whether a pair that was refused is to be found all the same, by a map that holds both.
@@ -65,7 +62,7 @@ impl Agent {
 
     /// Nobody in reach has the submap's further keypoints.
     fn is_further_out_of_reach(&self, id: SubmapId) -> bool {
-        self.address_of(id).is_some_and(|address| self.negotiation.out_of_reach.contains(&address))
+        self.address_of(id).is_some_and(|address| self.fetches.is_out_of_reach(address))
     }
 
     /// Whether what was found may stand: what a second look found is where the map has it. `None` if the map does not
@@ -120,30 +117,8 @@ impl Agent {
         let blob = self.knowledge.submap(id)?.blob;
         match self.negotiation.keypoints(blob) {
             Some(keypoints) => keypoints.further(),
-            None => self.gossip.blob(blob).and_then(Keypoints::address_in),
+            None => self.blobs.get(blob).and_then(Keypoints::address_in),
         }
-    }
-
-    /// The addresses of our own blobs: those that facts name, and those that these name.
-    pub(super) fn own_blobs(&self) -> BTreeSet<Hash> {
-        self.with_further(self.knowledge.blobs_of(self.context.robot()))
-    }
-
-    /// These blobs, and those that go on with them as far as they are here to say so.
-    pub(super) fn with_further(&self, blobs: impl IntoIterator<Item = Hash>) -> BTreeSet<Hash> {
-        let further = |blob| self.gossip.blob(blob).and_then(Keypoints::address_in);
-        blobs.into_iter().flat_map(|blob| [Some(blob), further(blob)]).flatten().collect()
-    }
-
-    /// The keypoints of a submap, with the further ones if these are wanted and there are any, and then their address.
-    /// `None` until they are here.
-    pub(super) fn keypoints_of(&mut self, submap: SubmapId, further: bool) -> Option<(Arc<Keypoints>, Option<Hash>)> {
-        let blob = self.knowledge.submap(submap)?.blob;
-        let first = self.keypoints_at(blob, submap)?;
-        let Some(address) = first.further().filter(|_| further) else { return Some((first, None)) };
-        let more = self.keypoints_at(address, submap)?;
-        // Further keypoints that do not fit the first ones are left out.
-        Some(first.with_further(&more).map_or((first, None), |both| (Arc::new(both), Some(address))))
     }
 }
 

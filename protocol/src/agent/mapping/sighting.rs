@@ -5,56 +5,25 @@
 //! by how it may have sped up, slowed down or turned. What is too old to say much is refused. A range and a bearing
 //! tell a place and no rotation: then a point is carried instead of a pose.
 
-use super::Agent;
-use super::beacons::LATE_SIGMA_SECS;
-use super::io::{PositionSighting, Sighting};
-use super::ledger::BATCHES_WAITING_MAX;
+use super::Mapping;
+use crate::agent::context::Context;
+use crate::agent::io::{PositionSighting, Sighting};
+use crate::agent::motion::moved_on;
+use crate::agent::replication::beacons::{Beacons, LATE_SIGMA_SECS};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use crate::ids::{Name, SubmapId};
 use crate::time::Stamp;
 use crate::wire::fact::{Fact, PositionFact, SightingFact};
-use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3};
 use std::collections::BTreeMap;
 
 /// Largest time between a sighting and the keyframe or beacon that tells where a robot was, s.
 pub const SIGHTING_AGE_SECS_MAX: f64 = 5.0;
-/// What a robot may speed up or slow down by, m/s² and rad/s², standard deviation.
-const ACCELERATION: [f64; 2] = [0.5, 0.5];
-/// The speed of a robot of which nobody knows how it moves, m/s and rad/s, standard deviation.
-const SPEED_UNKNOWN: [f64; 2] = [1.5, 1.0];
 /// A sighting whose rotation has a larger standard deviation, rad, tells where the other robot is, not how it is
 /// turned: no Gaussian about one rotation means much beyond.
 pub const TURN_SIGMA_MAX: f64 = 0.5;
 /// Another position from the same submap to the same one is stated with so much of the variance at most.
 const NEWS: f64 = 0.5;
-
-/// How a body moves: (ρ, φ) in its own frame, m and rad, a second.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Twist(Vector6<f64>);
-
-impl Twist {
-    /// Between two poses so many seconds apart; `None` if no time passed.
-    pub(super) fn between(from: &Se3, to: &Se3, secs: f64) -> Option<Self> {
-        let twist = from.local(to) / secs;
-        (secs > 0.0 && twist.iter().all(|x| x.is_finite())).then_some(Self(twist))
-    }
-}
-
-/// Where a body is so many seconds after (or before) it was at `t`, a time with a standard deviation of `sigma_secs`,
-/// and how sure that is.
-fn moved_on(t: &PoseWithCovariance, twist: Option<Twist>, secs: f64, sigma_secs: f64) -> PoseWithCovariance {
-    let rates = twist.map_or(SPEED_UNKNOWN, |Twist(v)| [0, 3].map(|k| v.fixed_rows::<3>(k).norm()));
-    let sigmas = match twist {
-        Some(_) => ACCELERATION.map(|change| 0.5 * change * secs * secs),
-        None => SPEED_UNKNOWN.map(|speed| speed * secs),
-    };
-    let [way, turn] = [0, 1].map(|k| sigmas[k] * sigmas[k] + (rates[k] * sigma_secs) * (rates[k] * sigma_secs));
-    let step = Se3::exp(&twist.map_or_else(Vector6::zeros, |twist| twist.0 * secs));
-    let back = step.inverse().adjoint();
-    let told = back * t.covariance.matrix() * back.transpose();
-    let more = Matrix6::from_diagonal(&Vector6::new(way, way, way, turn, turn, turn));
-    PoseWithCovariance { pose: t.pose * step, covariance: Covariance::new_or_wider(told + more) }
-}
 
 /// How sure the positions are that were stated of another robot's submap, seen from the submap that ours is known by.
 #[derive(Debug, Default)]
@@ -87,59 +56,65 @@ struct Meeting {
     t_j_other: PoseWithCovariance,
 }
 
-impl Agent {
+impl Mapping {
     /// A direct measurement of another robot becomes a fact, or is refused.
-    pub(super) fn on_sighting(&mut self, sighting: &Sighting) {
-        if self.is_hindered("sighting: receive-only", "sighting: overload") {
-            return;
-        }
-        match self.sighting_fact(sighting) {
-            Ok(Fact::Position(fact)) => self.state_position(fact),
-            Ok(fact) => _ = self.write(self.context.frame().epoch, &fact),
-            Err(detail) => self.context.reject(Some(self.context.robot()), "sighting", detail),
+    pub(in crate::agent) fn on_sighting(
+        &mut self,
+        context: &mut Context,
+        beacons: &Beacons,
+        sighting: &Sighting,
+    ) -> Option<Fact> {
+        match self.sighting_fact(context, beacons, sighting) {
+            Ok(fact) => self.is_news(&fact).then_some(fact),
+            Err(detail) => {
+                context.reject(Some(context.robot()), "sighting", detail);
+                None
+            }
         }
     }
 
     /// A direct measurement of where another robot is becomes a fact, or is refused.
-    pub(super) fn on_position(&mut self, sighting: &PositionSighting) {
-        if self.is_hindered("position: receive-only", "position: overload") {
-            return;
-        }
-        match self.position_fact(sighting) {
-            Ok(fact) => self.state_position(fact),
-            Err(detail) => self.context.reject(Some(self.context.robot()), "position", detail),
+    pub(in crate::agent) fn on_position(
+        &mut self,
+        context: &mut Context,
+        beacons: &Beacons,
+        sighting: &PositionSighting,
+    ) -> Option<Fact> {
+        match self.position_fact(context, beacons, sighting) {
+            Ok(fact) => Some(Fact::Position(fact)).filter(|fact| self.is_news(fact)),
+            Err(detail) => {
+                context.reject(Some(context.robot()), "position", detail);
+                None
+            }
         }
     }
 
-    fn position_fact(&self, sighting: &PositionSighting) -> Result<PositionFact, &'static str> {
+    /// A sighting was written down.
+    pub(in crate::agent) fn on_stated(&mut self, fact: &Fact) {
+        if let Fact::Position(position) = fact {
+            self.positions.note(position);
+        }
+    }
+
+    /// Whether it is worth stating: sensors see a robot many times a second.
+    fn is_news(&self, fact: &Fact) -> bool {
+        if let Fact::Position(position) = fact { self.positions.is_news(position) } else { true }
+    }
+
+    fn position_fact(
+        &self,
+        context: &Context,
+        beacons: &Beacons,
+        sighting: &PositionSighting,
+    ) -> Result<PositionFact, &'static str> {
         let (p, covariance) = parse_position(sighting)?;
-        Ok(self.meeting(&sighting.robot, sighting.stamp)?.position(sighting.stamp, &p, &covariance))
+        let met = self.meeting(context, beacons, &sighting.robot, sighting.stamp)?;
+        Ok(met.position(sighting.stamp, &p, &covariance))
     }
 
-    /// States a position, unless it is no news: sensors see a robot many times a second.
-    fn state_position(&mut self, fact: PositionFact) {
-        if self.positions.is_news(&fact) && self.write(self.context.frame().epoch, &Fact::Position(fact.clone())) {
-            self.positions.note(&fact);
-        }
-    }
-
-    /// Whether nothing can be stated now; if so it is refused under one of these names.
-    fn is_hindered(&mut self, receive_only: &'static str, overload: &'static str) -> bool {
-        if self.is_receive_only() {
-            self.context.reject(Some(self.context.robot()), receive_only, "it cannot be kept now");
-            return true;
-        }
-        if self.is_overloaded() {
-            let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk; the store is too slow");
-            self.context.reject(Some(self.context.robot()), overload, &detail);
-            return true;
-        }
-        false
-    }
-
-    fn sighting_fact(&self, sighting: &Sighting) -> Result<Fact, &'static str> {
+    fn sighting_fact(&self, context: &Context, beacons: &Beacons, sighting: &Sighting) -> Result<Fact, &'static str> {
         let t_body_other = parse(sighting)?;
-        let met = self.meeting(&sighting.robot, sighting.stamp)?;
+        let met = self.meeting(context, beacons, &sighting.robot, sighting.stamp)?;
         if t_body_other.covariance.sigmas().fixed_rows::<3>(3).max() > TURN_SIGMA_MAX {
             let turn = t_body_other.pose.rotation.matrix();
             let along = t_body_other.covariance.matrix().fixed_view::<3, 3>(0, 0).into_owned();
@@ -151,25 +126,31 @@ impl Agent {
     }
 
     /// Where we were at `stamp`, and the robot of that name.
-    fn meeting(&self, robot: &Name, stamp: Stamp) -> Result<Meeting, &'static str> {
-        let seen = self.context.robot_named(robot);
-        let seen = seen.filter(|id| *id != self.context.robot()).ok_or("names no other robot of the roster")?;
-        let (index, t_i_body, at) = self.mapper.body().ok_or("came before the first submap was finished")?;
+    fn meeting(
+        &self,
+        context: &Context,
+        beacons: &Beacons,
+        robot: &Name,
+        stamp: Stamp,
+    ) -> Result<Meeting, &'static str> {
+        let seen = context.robot_named(robot);
+        let seen = seen.filter(|id| *id != context.robot()).ok_or("names no other robot of the roster")?;
+        let (index, t_i_body, at) = self.body().ok_or("came before the first submap was finished")?;
         let own_age = stamp.secs_since(at);
         if own_age.abs() > SIGHTING_AGE_SECS_MAX {
             return Err(
                 "is too far in time from the last keyframe; hand over keyframes more often, with the same clock",
             );
         }
-        let beacon = self.gossip.beacon(seen).ok_or("names a robot of which no pose beacon was heard yet")?;
-        let age = self.context.now().since(beacon.since).as_secs_f64();
+        let beacon = beacons.of(seen).ok_or("names a robot of which no pose beacon was heard yet")?;
+        let age = context.now().since(beacon.since).as_secs_f64();
         if age > SIGHTING_AGE_SECS_MAX {
             return Err("names a robot whose last keyframe is too old, by its beacons; lower its gossip.pose_secs");
         }
         Ok(Meeting {
-            i: SubmapId { frame: self.context.frame(), index },
+            i: SubmapId { frame: context.frame(), index },
             j: beacon.content.anchor,
-            t_i_body: moved_on(&t_i_body, self.mapper.twist(), own_age, 0.0),
+            t_i_body: moved_on(&t_i_body, self.twist, own_age, 0.0),
             t_j_other: moved_on(&beacon.content.t_anchor_body, beacon.twist, age, LATE_SIGMA_SECS),
         })
     }
@@ -234,28 +215,6 @@ fn parse(sighting: &Sighting) -> Result<PoseWithCovariance, &'static str> {
 mod tests {
     use super::*;
     use crate::ids::{FrameId, RobotId};
-
-    #[test]
-    fn a_body_moves_on_as_it_did_and_the_less_sure_the_longer() {
-        let from = Se3::exp(&Vector6::new(1.0, 2.0, 0.5, 0.1, -0.2, 0.7));
-        let twist = Vector6::new(0.8, 0.1, 0.0, 0.0, 0.0, 0.3);
-        let to = from * Se3::exp(&(twist * 2.0));
-        assert_eq!(Twist::between(&from, &to, 0.0), None);
-        assert_eq!(Twist::between(&from, &to, -1.0), None);
-        let found = Twist::between(&from, &to, 2.0).unwrap();
-        assert!((found.0 - twist).norm() < 1e-12);
-        let t = PoseWithCovariance { pose: to, covariance: Covariance::from_sigmas([0.01; 6]).unwrap() };
-        let later = moved_on(&t, Some(found), 1.5, 0.0);
-        assert!((from * Se3::exp(&(twist * 3.5))).local(&later.pose).norm() < 1e-12);
-        let earlier = moved_on(&later, Some(found), -1.5, 0.0);
-        assert!(to.local(&earlier.pose).norm() < 1e-12);
-        let sigma = |t: &PoseWithCovariance| t.covariance.sigmas()[2];
-        assert!((sigma(&moved_on(&t, Some(found), 0.0, 0.0)) - 0.01).abs() < 1e-12);
-        assert!(sigma(&later) > 0.5 * ACCELERATION[0] * 1.5 * 1.5 && sigma(&earlier) > sigma(&later));
-        let late = sigma(&moved_on(&t, Some(found), 0.0, 0.5));
-        assert!((late - 0.01f64.hypot(0.5 * twist.fixed_rows::<3>(0).norm())).abs() < 1e-9, "{late}");
-        assert!(sigma(&moved_on(&t, None, 1.5, 0.0)) > SPEED_UNKNOWN[0] * 1.5);
-    }
 
     /// Of one pair of submaps the first is news, and what has half the variance; as soon as we are known by another,
     /// all is.

@@ -6,11 +6,10 @@
 //! A refusal that is lost costs a try and no truth. So nothing waits for it, and it waits itself, for other records to
 //! go to the disk with or until there are several: a commit for each would wear small disks out.
 
-use super::Agent;
-use super::io::Record;
-use super::knowledge::Pair;
+use crate::agent::io::Record;
+use crate::agent::replication::knowledge::{Knowledge, Pair};
 use crate::config::{AlignConfig, Config, SubmapConfig};
-use crate::ids::{Hash, SubmapId};
+use crate::ids::Hash;
 use std::collections::BTreeMap;
 
 /// Refused pairs kept on the disk, of about 100 bytes each. Further ones are tried again after a restart.
@@ -56,69 +55,41 @@ impl Refusals {
         self.held.len() < REFUSED_MAX || self.held.contains_key(&pair)
     }
 
-    fn add(&mut self, pair: Pair, evidence: u64) {
+    /// A pair was refused on this evidence.
+    pub fn add(&mut self, pair: Pair, evidence: u64) {
         if self.has_room(pair) && self.held.insert(pair, evidence) != Some(evidence) {
             self.waiting.push(Record::Refused { i: pair.0, j: pair.1, evidence: Some(evidence) });
         }
     }
 
     /// Takes pairs off the list, and off the disk.
-    fn forget(&mut self, gone: &[Pair]) {
+    pub fn forget(&mut self, gone: &[Pair]) {
         for pair in gone.iter().filter(|pair| self.held.remove(pair).is_some()) {
             self.waiting.push(counts_no_more(*pair));
         }
     }
 
+    /// All pairs held.
+    pub fn pairs(&self) -> impl Iterator<Item = Pair> {
+        self.held.keys().copied()
+    }
+
+    /// Those that wait go to the disk with whatever else does now.
+    pub fn save(&mut self, mut keep: impl FnMut(Record)) {
+        self.waiting.drain(..).for_each(&mut keep);
+    }
+
+    /// A digest of what a try of this pair rests on; `None` if a submap of it is not known.
+    pub fn evidence(&self, knowledge: &Knowledge, (i, j): Pair) -> Option<u64> {
+        let blob = |id| knowledge.submap(id).map(|known| known.blob);
+        let Hash(digest) = Hash::of(&[self.how.0, blob(i)?.0, blob(j)?.0].concat());
+        Some(u64::from_le_bytes(*digest.first_chunk()?))
+    }
+
     /// The pairs of which this is so.
-    fn which(&self, is_so: impl Fn(Pair, u64) -> bool) -> Vec<Pair> {
+    pub fn which(&self, is_so: impl Fn(Pair, u64) -> bool) -> Vec<Pair> {
         let pairs = self.held.iter().map(|(pair, evidence)| (*pair, *evidence));
         pairs.filter(|(pair, evidence)| is_so(*pair, *evidence)).map(|(pair, _)| pair).collect()
-    }
-}
-
-impl Agent {
-    /// A pair that we tried was refused. One of a submap that went meanwhile cannot be tried again, whatever is known.
-    pub(super) fn note_refusal(&mut self, pair: Pair) {
-        let is_gone = |id: SubmapId| id.frame.robot == self.context.robot() && self.negotiation.features(id).is_none();
-        if is_gone(pair.0) || is_gone(pair.1) {
-            return;
-        }
-        if let Some(evidence) = self.evidence(pair) {
-            self.refusals.add(pair, evidence);
-        }
-    }
-
-    /// All facts were learned anew: refusals that rest on what is still so count as tried, others no more.
-    pub(super) fn weigh_refusals(&mut self) {
-        let gone = self.refusals.which(|pair, evidence| self.evidence(pair) != Some(evidence));
-        self.refusals.forget(&gone);
-        gone.into_iter().for_each(|pair| self.negotiation.retry(pair));
-        for &(i, j) in self.refusals.held.keys() {
-            // Of a loop, ours is the one that was made later: it was paired up with those before it.
-            let (mine, theirs) = if j.frame.robot == self.context.robot() { (j, i) } else { (i, j) };
-            self.negotiation.restore_tried(mine, theirs);
-        }
-    }
-
-    /// Submaps are gone, and with them what was refused of them.
-    pub(super) fn forget_refusals(&mut self, is_gone: impl Fn(SubmapId) -> bool) {
-        let gone = self.refusals.which(|(i, j), _| is_gone(i) || is_gone(j));
-        self.refusals.forget(&gone);
-    }
-
-    /// Refusals go to the disk with whatever else does now.
-    pub(super) fn save_refusals(&mut self) {
-        self.refusals.waiting.drain(..).for_each(|record| self.context.keep(record));
-    }
-
-    /// A digest of what a try of this pair rests on; `None` if it is no pair that we could try.
-    fn evidence(&self, (i, j): Pair) -> Option<u64> {
-        if i.frame.robot != self.context.robot() && j.frame.robot != self.context.robot() {
-            return None;
-        }
-        let blob = |id| self.knowledge.submap(id).map(|known| known.blob);
-        let Hash(digest) = Hash::of(&[self.refusals.how.0, blob(i)?.0, blob(j)?.0].concat());
-        Some(u64::from_le_bytes(*digest.first_chunk()?))
     }
 }
 
@@ -137,7 +108,7 @@ fn how(config: &Config) -> Hash {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ids::{FrameId, RobotId};
+    use crate::ids::{FrameId, RobotId, SubmapId};
 
     fn pair(index: u32) -> Pair {
         let submap = |robot, index| SubmapId { frame: FrameId { robot: RobotId([robot; 8]), epoch: 1 }, index };

@@ -1,27 +1,19 @@
 //! What goes on the link, and what waits (DESIGN §4): everything sent is paid from one [`Budget`]; new entries of ours
 //! wait in order for their turn, answers are cut to what is left or put off, and what is put off is asked for again.
 
-use super::Agent;
-use super::gossip::Gossip;
-use super::io::{Channel, Output, QueryId};
+use super::Replication;
+use crate::agent::context::Context;
+use crate::agent::io::{Channel, Output};
 use crate::gossip::{Budget, Class, PIECE_BYTES_MIN, REPAIR_BYTES_MIN};
 use crate::ids::{EntryId, Hash};
 use crate::replica::Have;
 use crate::time::Instant;
 use crate::wire::Delta;
-use crate::wire::limits::BLOB_PIECE_LEN;
 use crate::wire::messages::{Message, carried_len};
-use core::time::Duration;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 
 /// New entries of ours that wait for the link; of more the oldest are left to repair.
 pub const UNSENT_MAX: usize = 256;
-/// Times in a row that a piece of a blob may be put off; then its holder counts as one that does not have it.
-pub const POSTPONED_MAX: u32 = 8;
-/// Pause after a piece of a blob was put off; it doubles...
-const POSTPONED_PAUSE: Duration = Duration::from_millis(500);
-/// ...so many times at most.
-const POSTPONED_DOUBLINGS: u32 = 4;
 
 /// The agent's side of the budget.
 pub(super) struct Traffic {
@@ -30,14 +22,12 @@ pub(super) struct Traffic {
     unsent: VecDeque<EntryId>,
     /// A turn to announce or ask is held back until then, and was counted.
     held_until: Instant,
-    /// Times in a row that the next piece of a blob was put off.
-    postponed: BTreeMap<Hash, u32>,
 }
 
 impl Traffic {
     pub(super) fn new(bytes_per_sec: f64, now: Instant) -> Self {
         let budget = Budget::new(bytes_per_sec, now);
-        Self { budget, unsent: VecDeque::new(), held_until: now, postponed: BTreeMap::new() }
+        Self { budget, unsent: VecDeque::new(), held_until: now }
     }
 
     /// Whether a message of this class may go.
@@ -50,85 +40,74 @@ impl Traffic {
         self.budget.due(now, class)
     }
 
-    /// A piece of this blob came.
-    pub(super) fn not_postponed(&mut self, hash: Hash) {
-        self.postponed.remove(&hash);
-    }
-
     /// When the next of our waiting entries may go.
     pub(super) fn timeout(&self, now: Instant) -> Option<Instant> {
         (!self.unsent.is_empty()).then(|| self.due(now, Class::Facts))
     }
 }
 
-impl Agent {
+impl Replication {
     /// Broadcasts.
-    pub(super) fn publish(&mut self, channel: Channel, message: &Message) {
-        let bytes = self.pay_for(message);
-        self.context.put(Output::Publish { channel, bytes });
+    pub(super) fn publish(&mut self, context: &mut Context, channel: Channel, message: &Message) {
+        let bytes = self.pay_for(context, message);
+        context.put(Output::Publish { channel, bytes });
     }
 
     /// The bytes of a message that goes out, counted and paid.
-    pub(super) fn pay_for(&mut self, message: &Message) -> Vec<u8> {
-        let bytes = self.count(message);
-        self.gossip.traffic.budget.pay(self.context.now(), bytes.len());
+    pub(super) fn pay_for(&mut self, context: &mut Context, message: &Message) -> Vec<u8> {
+        let bytes = count(context, message);
+        self.gossip.traffic.budget.pay(context.now(), bytes.len());
         bytes
     }
 
     /// The same for an answer, which takes nothing from the classes above its own.
-    pub(super) fn pay_for_answer(&mut self, class: Class, message: &Message) -> Vec<u8> {
-        let bytes = self.count(message);
-        self.gossip.traffic.budget.pay_answer(self.context.now(), class, bytes.len());
-        bytes
-    }
-
-    fn count(&mut self, message: &Message) -> Vec<u8> {
-        let bytes = message.encode();
-        self.context.count().sent(message.kind(), bytes.len());
+    pub(super) fn pay_for_answer(&mut self, context: &mut Context, class: Class, message: &Message) -> Vec<u8> {
+        let bytes = count(context, message);
+        self.gossip.traffic.budget.pay_answer(context.now(), class, bytes.len());
         bytes
     }
 
     /// Whether to announce, ask or negotiate now. If not, a turn is held back: one each time that the link is full.
-    pub(super) fn may_speak(&mut self) -> bool {
+    pub(super) fn may_speak(&mut self, context: &mut Context) -> bool {
         let Traffic { budget, held_until, .. } = &mut self.gossip.traffic;
-        let may = budget.may(self.context.now(), Class::Have);
-        if !may && *held_until <= self.context.now() {
-            *held_until = budget.due(self.context.now(), Class::Have);
-            self.context.count().held_back(Class::Have, 1);
+        let may = budget.may(context.now(), Class::Have);
+        if !may && *held_until <= context.now() {
+            *held_until = budget.due(context.now(), Class::Have);
+            context.count().held_back(Class::Have, 1);
         }
         may
     }
 
     /// Publishes entries of ours that just became durable, or has them wait.
-    pub(super) fn publish_entries(&mut self, ids: &[EntryId]) {
+    pub(super) fn publish_entries(&mut self, context: &mut Context, ids: &[EntryId]) {
         self.gossip.traffic.unsent.extend(ids);
-        self.publish_unsent();
+        self.publish_unsent(context);
         let unsent = &mut self.gossip.traffic.unsent;
         let held = unsent.len().min(ids.len());
         // Repair brings the others; the latest are the most wanted.
         unsent.drain(..unsent.len().saturating_sub(UNSENT_MAX));
         if held > 0 {
-            self.context.count().held_back(Class::Facts, held);
+            context.count().held_back(Class::Facts, held);
         }
     }
 
     /// Publishes what waits, as far as there is room.
-    pub(super) fn publish_unsent(&mut self) {
+    pub(super) fn publish_unsent(&mut self, context: &mut Context) {
         if self.is_alone() {
             return self.gossip.traffic.unsent.clear(); // Nobody listens; whoever comes will sync.
         }
-        while !self.gossip.traffic.unsent.is_empty() && self.gossip.traffic.may(self.context.now(), Class::Facts) {
-            let entries = self.next_unsent();
+        while !self.gossip.traffic.unsent.is_empty() && self.gossip.traffic.may(context.now(), Class::Facts) {
+            let entries = self.next_unsent(context);
             for message in Message::facts(entries) {
-                self.publish(Channel::Facts, &message);
+                self.publish(context, Channel::Facts, &message);
             }
         }
     }
 
     /// The entries that go next: one at least, and as many as there is room for.
-    fn next_unsent(&mut self) -> Vec<Vec<u8>> {
+    fn next_unsent(&mut self, context: &Context) -> Vec<Vec<u8>> {
         let Traffic { budget, unsent, .. } = &mut self.gossip.traffic;
-        let mut left = budget.left(self.context.now(), Class::Facts);
+        let mut left = budget.left(context.now(), Class::Facts);
         let mut entries = Vec::new();
         while let Some(id) = unsent.front() {
             // One that a floor has replaced meanwhile is gone.
@@ -146,53 +125,37 @@ impl Agent {
 
     /// What the holder of `have` lacks, as much of it as there is room for. If there is no room for what is there, the
     /// answer says that there is more, and holds nothing: it is asked for again.
-    pub(super) fn repair(&mut self, have: &Have) -> Delta {
-        let left = self.gossip.traffic.budget.left(self.context.now(), Class::Repair);
+    pub(super) fn repair(&mut self, context: &mut Context, have: &Have) -> Delta {
+        let left = self.gossip.traffic.budget.left(context.now(), Class::Repair);
         let delta =
-            self.replica.delta_for(have, left.max(REPAIR_BYTES_MIN).min(self.context.config().gossip.delta_bytes_max));
+            self.replica.delta_for(have, left.max(REPAIR_BYTES_MIN).min(context.config().gossip.delta_bytes_max));
         if left >= REPAIR_BYTES_MIN || carried_by(&delta) <= left {
             return delta;
         }
-        self.context.count().held_back(Class::Repair, 1);
+        context.count().held_back(Class::Repair, 1);
         Delta { more: true, ..Delta::default() }
     }
 
     /// The part of a blob that was asked for, as much of it as there is room for; an empty one says "not now".
-    pub(super) fn piece(&mut self, hash: Hash, offset: usize, len: usize) -> Option<Message> {
-        let blob = self.gossip.blob(hash)?;
+    pub(super) fn piece(&self, context: &mut Context, hash: Hash, offset: usize, len: usize) -> Option<Message> {
+        let blob = self.blobs.get(hash)?;
         let asked = blob.get(offset..offset.saturating_add(len).min(blob.len()))?; // Beyond its end there is nothing.
-        let left = self.gossip.traffic.budget.left(self.context.now(), Class::Blob);
+        let left = self.gossip.traffic.budget.left(context.now(), Class::Blob);
         let fits = left >= PIECE_BYTES_MIN || asked.len() <= left;
         let bytes = if fits { asked[..asked.len().min(left)].to_vec() } else { Vec::new() };
         let total = blob.len() as u32;
         if !fits {
-            self.context.count().held_back(Class::Blob, 1);
+            context.count().held_back(Class::Blob, 1);
         }
         Some(Message::BlobReply { hash, offset: offset as u32, total, bytes })
     }
-
-    /// The holder of a blob has no room on its link: it is asked again after a pause, and after many counts as one that
-    /// does not have it.
-    pub(super) fn fetch_postponed(&mut self, query: QueryId, hash: Hash) {
-        let Gossip { traffic, .. } = &mut self.gossip;
-        traffic.postponed.retain(|hash, _| self.negotiation.fetches.contains_key(hash));
-        let times = traffic.postponed.entry(hash).or_default();
-        *times += 1;
-        if *times > POSTPONED_MAX {
-            traffic.postponed.remove(&hash);
-            return self.negotiation.fetch_failed(query, self.context.now());
-        }
-        let pause = POSTPONED_PAUSE * 2u32.pow((*times - 1).min(POSTPONED_DOUBLINGS));
-        if let Some(fetch) = self.negotiation.fetches.get_mut(&hash) {
-            fetch.query = None;
-            fetch.not_before = self.context.now().after(pause);
-        }
-    }
 }
 
-/// Whether a piece has a length that an honest holder would send, of a blob of which so much is lacking.
-pub(super) fn is_piece(len: usize, lacking: usize) -> bool {
-    (lacking.min(PIECE_BYTES_MIN)..=lacking.min(BLOB_PIECE_LEN)).contains(&len)
+/// The bytes of a message that goes out, counted.
+fn count(context: &mut Context, message: &Message) -> Vec<u8> {
+    let bytes = message.encode();
+    context.count().sent(message.kind(), bytes.len());
+    bytes
 }
 
 fn carried_by(delta: &Delta) -> usize {
@@ -201,10 +164,9 @@ fn carried_by(delta: &Delta) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::super::negotiation::Fetch;
-    use super::super::{Identity, Restored};
     use super::*;
     use crate::agent::io::{Input, Record};
+    use crate::agent::{Agent, Identity, Restored};
     use crate::config::Config;
     use crate::ids::Name;
     use crate::replica::testing::{MEMBERS, chain};
@@ -223,7 +185,7 @@ mod tests {
         let restored = Restored { records, fresh_epoch: 1 };
         let mut agent = Agent::new(config, identity, 1, restored, Instant::ZERO).unwrap();
         agent.handle(Instant::ZERO, Input::Neighbour { robot: samples::robot(1), up: true });
-        agent.gossip.traffic.budget.pay(Instant::ZERO, usize::MAX);
+        agent.replication.gossip.traffic.budget.pay(Instant::ZERO, usize::MAX);
         while agent.poll_output().is_some() {}
         (agent, (0..entries).map(id).collect())
     }
@@ -243,7 +205,7 @@ mod tests {
     fn new_entries_wait_for_the_link_in_order_and_of_too_many_the_oldest_are_left_to_repair() {
         for excess in [0, 1] {
             let (mut agent, ids) = starved((UNSENT_MAX + excess) as u32);
-            agent.publish_entries(&ids);
+            agent.replication.publish_entries(&mut agent.context, &ids);
             assert!(published(&mut agent).is_empty());
             assert_eq!(agent.context.stats().held_back["facts"], ids.len() as u64);
             let mut came = Vec::new();
@@ -256,53 +218,18 @@ mod tests {
                 came.extend(new);
             }
             let wanted: Vec<Vec<u8>> =
-                ids[excess..].iter().map(|id| agent.replica.entry_bytes(*id).unwrap().to_vec()).collect();
+                ids[excess..].iter().map(|id| agent.replication.replica.entry_bytes(*id).unwrap().to_vec()).collect();
             assert_eq!(came, wanted);
             assert!(messages > 4, "as the link has room: {messages}");
-            assert!(agent.gossip.traffic.unsent.is_empty());
+            assert!(agent.replication.gossip.traffic.unsent.is_empty());
         }
     }
 
     #[test]
     fn entries_that_wait_are_forgotten_when_nobody_listens() {
         let (mut agent, ids) = starved(3);
-        agent.publish_entries(&ids);
+        agent.replication.publish_entries(&mut agent.context, &ids);
         agent.handle(Instant::ZERO, Input::Neighbour { robot: samples::robot(1), up: false });
-        assert!(agent.gossip.traffic.unsent.is_empty());
-    }
-
-    #[test]
-    fn a_blob_that_is_put_off_is_asked_for_again_until_its_holder_counts_as_one_without_it() {
-        let (mut agent, _) = starved(1);
-        let (hash, query) = (Hash::of(b"x"), QueryId(7));
-        let mut fetch = Fetch::new(samples::robot(1), Instant::ZERO);
-        fetch.query = Some(query);
-        agent.negotiation.fetches.insert(hash, fetch);
-        let mut pauses = Vec::new();
-        for _ in 0..POSTPONED_MAX {
-            agent.negotiation.fetches.get_mut(&hash).unwrap().query = Some(query);
-            agent.fetch_postponed(query, hash);
-            let fetch = &agent.negotiation.fetches[&hash];
-            assert!(fetch.failures == 0 && fetch.query.is_none());
-            pauses.push(fetch.not_before.since(Instant::ZERO).as_millis());
-        }
-        assert_eq!(pauses[..6], [500, 1_000, 2_000, 4_000, 8_000, 8_000]);
-        agent.negotiation.fetches.get_mut(&hash).unwrap().query = Some(query);
-        agent.fetch_postponed(query, hash);
-        assert_eq!(agent.negotiation.fetches[&hash].failures, 1);
-        agent.gossip.traffic.not_postponed(hash);
-        agent.fetch_postponed(query, hash);
-        assert_eq!(agent.negotiation.fetches[&hash].not_before.since(Instant::ZERO).as_millis(), 500);
-    }
-
-    #[test]
-    fn a_piece_is_neither_too_short_nor_too_long() {
-        let lengths = |lacking| {
-            [PIECE_BYTES_MIN - 1, PIECE_BYTES_MIN, 5_000, BLOB_PIECE_LEN, BLOB_PIECE_LEN + 1]
-                .map(|len| is_piece(len, lacking))
-        };
-        assert_eq!(lengths(40_000), [false, true, true, true, false]);
-        assert_eq!(lengths(5_000), [false, true, true, false, false]);
-        assert_eq!(lengths(PIECE_BYTES_MIN - 1), [true, false, false, false, false], "the last may be short");
+        assert!(agent.replication.gossip.traffic.unsent.is_empty());
     }
 }

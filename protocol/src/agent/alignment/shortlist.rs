@@ -1,6 +1,6 @@
 //! The most alike pairs of submaps, up to a limit: in whatever order pairs are offered, the same ones are kept.
 
-use super::knowledge::{Pair, pair_of};
+use crate::agent::replication::knowledge::{Pair, pair_of};
 use crate::ids::SubmapId;
 use crate::submap::Similarity;
 use std::collections::{BTreeMap, BTreeSet};

@@ -8,17 +8,15 @@
 //! odometry. Every pair is tried once, and once more with [further keypoints](super::second_look) if it was refused and
 //! should not have been; every foreign alignment that names us is verified once.
 
-use super::io::{JobId, QueryId};
-use super::knowledge::{Knowledge, Pair, pair_of};
 use super::overlap_model::{OverlapModel, Prediction};
-use super::recent::Recent;
 use super::second_look::SECOND_LOOKS_MAX;
 use super::shortlist::{Candidate, Shortlist};
+use crate::agent::io::JobId;
+use crate::agent::recent::Recent;
+use crate::agent::replication::knowledge::{Knowledge, Pair, pair_of};
 use crate::config::Sensor;
 use crate::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use crate::submap::{Features, Keypoints};
-use crate::time::Instant;
-use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -50,15 +48,6 @@ pub const FEATURES_MAX: usize = 2_000;
 pub const VERIFICATIONS_MAX: usize = 1_024;
 /// Pairs remembered as tried.
 pub const TRIED_MAX: usize = 1_000_000;
-/// Blobs fetched at once.
-pub const FETCHES_MAX: usize = 4;
-/// Blobs begun and not yet here, at most.
-pub const FETCHES_WAITING_MAX: usize = 64;
-/// Attempts after which a blob counts as out of reach, until a neighbour appears who may have it.
-pub const FETCH_ATTEMPTS_MAX: u32 = 6;
-/// Longest pause between two attempts to fetch one blob.
-pub const FETCH_BACKOFF_MAX: Duration = Duration::from_secs(30);
-
 /// What a running alignment is for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Purpose {
@@ -81,28 +70,6 @@ pub struct Work {
     pub further: Option<Hash>,
 }
 
-/// A blob on its way, piece by piece.
-#[derive(Clone, Debug)]
-pub struct Fetch {
-    /// The pieces that came, in order.
-    pub got: Vec<u8>,
-    /// The robot that made it.
-    pub owner: RobotId,
-    /// The question under way, if any.
-    pub query: Option<QueryId>,
-    /// Questions that failed so far.
-    pub failures: u32,
-    /// Not asked again before.
-    pub not_before: Instant,
-}
-
-impl Fetch {
-    /// A fetch of which nothing came yet and no peer is asked.
-    pub fn new(owner: RobotId, now: Instant) -> Self {
-        Self { got: Vec::new(), owner, query: None, failures: 0, not_before: now }
-    }
-}
-
 /// Everything the negotiation remembers.
 #[derive(Debug)]
 pub struct Negotiation {
@@ -115,10 +82,6 @@ pub struct Negotiation {
     pub overlap_model: OverlapModel,
     /// Foreign alignments to answer.
     pub verify: BTreeSet<EntryId>,
-    /// Blobs on their way.
-    pub fetches: BTreeMap<Hash, Fetch>,
-    /// Blobs that nobody in reach has: pairs that need them wait without counting as work.
-    pub out_of_reach: BTreeSet<Hash>,
     /// Jobs under way.
     pub running: BTreeMap<JobId, Work>,
     /// Pairs that were let through and paid for, and not tried yet.
@@ -142,8 +105,6 @@ impl Negotiation {
             tries: BTreeMap::new(),
             overlap_model: OverlapModel::new(sensor),
             verify: BTreeSet::new(),
-            fetches: BTreeMap::new(),
-            out_of_reach: BTreeSet::new(),
             running: BTreeMap::new(),
             begun: BTreeSet::new(),
             stirred: false,
@@ -316,30 +277,6 @@ impl Negotiation {
         self.begun.clear();
         self.verify.clear();
     }
-
-    /// Whether no further fetch is to be begun. Those that wait for a holder's link do not count, up to a limit: one
-    /// neighbour that puts everything off must not keep us from the blobs of others.
-    pub fn is_fetching_enough(&self, now: Instant) -> bool {
-        let live = self.fetches.values().filter(|fetch| fetch.query.is_some() || fetch.not_before <= now).count();
-        live >= 2 * FETCHES_MAX || self.fetches.len() >= FETCHES_WAITING_MAX
-    }
-
-    /// Notes the outcome of a fetch attempt that failed at `now`.
-    pub fn fetch_failed(&mut self, query: QueryId, now: Instant) {
-        let failed = self.fetches.iter_mut().find(|(_, fetch)| fetch.query == Some(query));
-        if let Some((&hash, fetch)) = failed {
-            fetch.query = None;
-            if fetch.failures + 1 >= FETCH_ATTEMPTS_MAX {
-                self.fetches.remove(&hash);
-                self.out_of_reach.insert(hash);
-                self.stirred = true;
-                return;
-            }
-            fetch.failures = fetch.failures.saturating_add(1);
-            let backoff = Duration::from_millis(500) * 2u32.pow(fetch.failures.min(7));
-            fetch.not_before = now.after(backoff.min(FETCH_BACKOFF_MAX));
-        }
-    }
 }
 
 #[cfg(test)]
@@ -432,38 +369,5 @@ mod tests {
             tried += 1;
         }
         assert_eq!(tried, TRIES_PER_SUBMAP);
-    }
-
-    #[test]
-    fn fetches_that_wait_for_a_link_stop_no_others_up_to_a_limit() {
-        let later = Instant::ZERO.after(Duration::from_secs(5));
-        for (not_before, limit) in [(later, FETCHES_WAITING_MAX), (Instant::ZERO, 2 * FETCHES_MAX)] {
-            let mut n = Negotiation::new(Sensor::Points3d);
-            for k in 0..limit {
-                assert!(!n.is_fetching_enough(Instant::ZERO), "{k} of {limit}");
-                let fetch = Fetch { not_before, ..Fetch::new(RobotId([2; 8]), Instant::ZERO) };
-                n.fetches.insert(Hash::of(&k.to_le_bytes()), fetch);
-            }
-            assert!(n.is_fetching_enough(Instant::ZERO));
-        }
-    }
-
-    #[test]
-    fn a_failing_fetch_backs_off_and_is_given_up_at_the_bound() {
-        let mut n = Negotiation::new(Sensor::Points3d);
-        let (hash, query) = (Hash::of(b"x"), QueryId(7));
-        n.fetches.insert(hash, Fetch::new(RobotId([2; 8]), Instant::ZERO));
-        let mut last = Duration::ZERO;
-        for _ in 1..FETCH_ATTEMPTS_MAX {
-            n.fetches.get_mut(&hash).unwrap().query = Some(query);
-            n.fetch_failed(query, Instant::ZERO);
-            let pause = n.fetches[&hash].not_before.since(Instant::ZERO);
-            assert!(pause > last && pause <= FETCH_BACKOFF_MAX);
-            last = pause;
-        }
-        assert!(!n.out_of_reach.contains(&hash));
-        n.fetches.get_mut(&hash).unwrap().query = Some(query);
-        n.fetch_failed(query, Instant::ZERO);
-        assert!(n.fetches.is_empty() && n.out_of_reach.contains(&hash));
     }
 }

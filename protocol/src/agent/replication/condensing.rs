@@ -4,9 +4,10 @@
 //!
 //! Submaps go only where their neighbours stay: what a peer recognises there, it finds a few submaps on.
 
-use super::Agent;
-use super::io::{Event, Record};
+use super::Replication;
 use super::knowledge::Knowledge;
+use crate::agent::context::Context;
+use crate::agent::io::{Event, Record};
 use crate::ids::{EntryId, FrameId, Hash, SubmapId};
 use crate::wire::Entry;
 use crate::wire::fact::{CarriedFact, CondensedFact, Fact, SubmapFact};
@@ -36,49 +37,61 @@ pub(super) struct Shorter {
     pub(super) gone: Vec<(SubmapId, Hash)>,
 }
 
-impl Agent {
-    /// Shortens our log, if it is long and all of it is durable.
-    pub(super) fn condense(&mut self) {
-        let frame = self.context.frame();
-        let wanted = self.context.config().gossip.condense_entries;
-        let Some(held) = self.replica.settled(frame) else { return };
+impl Replication {
+    /// Shortens our log, if it is long and all of it is durable. The submaps that are gone.
+    pub(in crate::agent) fn condense(&mut self, context: &mut Context) -> BTreeSet<SubmapId> {
+        self.condensed(context).unwrap_or_default()
+    }
+
+    fn condensed(&mut self, context: &mut Context) -> Option<BTreeSet<SubmapId>> {
+        let frame = context.frame();
+        let wanted = context.config().gossip.condense_entries;
+        let held = self.replica.settled(frame)?;
         let count = held.end - held.start;
-        if wanted == 0 || self.is_receive_only() || count < wanted.max(self.condensing.again_at) {
-            return;
+        if wanted == 0 || self.is_receive_only(context) || count < wanted.max(self.condensing.again_at) {
+            return None;
         }
         self.condensing.again_at = count.saturating_mul(2);
         let entries: Vec<Entry> = held.filter_map(|seq| self.replica.entry(EntryId { frame, seq })).collect();
         let before: usize = entries.iter().map(|entry| entry.encode().len()).sum();
-        let Some(shorter) = shorten(frame, &entries, &self.knowledge) else { return };
+        let shorter = shorten(frame, &entries, &self.knowledge)?;
         let overhead = entries.first().map_or(0, |entry| entry.encode().len() - entry.payload().len());
         let payloads = shorter.parts.iter().filter_map(|part| Fact::Condensed(part.clone()).to_payload().ok());
         let after: usize = payloads.map(|payload| payload.len() + overhead).sum();
         if after as f64 > WORTHWHILE * before as f64 {
-            return;
+            return None;
         }
-        match self.replica.append_floor(&self.context.me().key, frame.epoch, &shorter.parts) {
-            Ok(new) => self.replace(frame, &new, &shorter.gone, [before, after]),
-            Err(error) => self.context.reject(Some(self.context.robot()), "own fact: condensed", &error.to_string()),
+        match self.replica.append_floor(&context.me().key, frame.epoch, &shorter.parts) {
+            Ok(new) => self.replace(context, &new, &shorter.gone, [before, after]),
+            Err(error) => {
+                context.reject(Some(context.robot()), "own fact: condensed", &error.to_string());
+                None
+            }
         }
     }
 
-    fn replace(&mut self, frame: FrameId, new: &[Entry], gone: &[(SubmapId, Hash)], bytes: [usize; 2]) {
+    fn replace(
+        &mut self,
+        context: &mut Context,
+        new: &[Entry],
+        gone: &[(SubmapId, Hash)],
+        bytes: [usize; 2],
+    ) -> Option<BTreeSet<SubmapId>> {
         self.condensing.again_at = u32::try_from(2 * new.len()).unwrap_or(u32::MAX);
-        let Some(below) = new.first().map(Entry::id) else { return };
+        let below = new.first().map(Entry::id)?;
         for entry in new {
-            self.context.keep(Record::Entry { id: entry.id(), bytes: entry.encode() });
+            context.keep(Record::Entry { id: entry.id(), bytes: entry.encode() });
         }
-        let submaps = gone.iter().map(|(submap, _)| *submap).collect();
+        let submaps: BTreeSet<SubmapId> = gone.iter().map(|(submap, _)| *submap).collect();
         // Two submaps can share a blob: equal bytes have one address.
-        let stays = |id: &SubmapId| gone.binary_search_by_key(id, |(submap, _)| *submap).is_err();
-        let all = self.knowledge.submaps().filter(|(id, _)| stays(id));
-        let kept = self.with_further(all.map(|(_, known)| known.blob));
-        let blobs = self.with_further(gone.iter().map(|(_, blob)| *blob)).difference(&kept).copied().collect();
-        self.context.keep(Record::Replaced { below, submaps, blobs });
-        gone.iter().for_each(|(submap, _)| self.negotiation.forget(*submap));
-        self.forget_refusals(|submap| gone.binary_search_by_key(&submap, |(id, _)| *id).is_ok());
-        self.context.count().condensed(bytes);
-        self.context.event(Event::Condensed { frame, parts: new.len(), submaps_gone: gone.len(), bytes });
+        let all = self.knowledge.submaps().filter(|(id, _)| !submaps.contains(id));
+        let kept = self.blobs.with_further(all.map(|(_, known)| known.blob));
+        let of_gone = self.blobs.with_further(gone.iter().map(|(_, blob)| *blob));
+        let blobs = of_gone.difference(&kept).copied().collect();
+        context.keep(Record::Replaced { below, submaps: submaps.iter().copied().collect(), blobs });
+        context.count().condensed(bytes);
+        context.event(Event::Condensed { frame: below.frame, parts: new.len(), submaps_gone: gone.len(), bytes });
+        Some(submaps)
     }
 }
 

@@ -231,7 +231,7 @@ impl Knowledge {
     }
 
     /// Whether an alignment names other blobs than its submaps' own facts do: it was computed from further keypoints.
-    pub(super) fn is_second_look(&self, fact: &AlignmentFact) -> bool {
+    pub fn is_second_look(&self, fact: &AlignmentFact) -> bool {
         let stated = |id: SubmapId| self.submap(id).map(|known| known.blob);
         [stated(fact.i), stated(fact.j)] != fact.blobs.map(Some)
     }
@@ -367,7 +367,7 @@ impl Knowledge {
     }
 
     /// Pairs within a frame of which its owner tells that one fits at another place as well.
-    pub(super) fn lookalikes_of(&self, frame: FrameId) -> BTreeSet<(u32, u32)> {
+    pub fn lookalikes_of(&self, frame: FrameId) -> BTreeSet<(u32, u32)> {
         let told = self.lookalikes.range(EntryId { frame, seq: 0 }..=EntryId { frame, seq: u32::MAX });
         told.map(|(_, pair)| (pair.i, pair.j)).collect()
     }
@@ -382,7 +382,7 @@ impl Knowledge {
     }
 
     /// Whether a LiDAR saw the submap, by its owner's word.
-    pub(super) fn is_of_ranges(&self, id: SubmapId) -> bool {
+    pub fn is_of_ranges(&self, id: SubmapId) -> bool {
         self.submap(id).and_then(|known| known.summary.as_ref()).is_some_and(Summary::is_of_ranges)
     }
 

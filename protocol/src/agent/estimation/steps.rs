@@ -1,7 +1,7 @@
 //! The steps of odometry of the last problem posed, kept for the next: between two solutions a swarm learns a few
 //! facts, and to read all the others from their entries again is most of what posing a problem costs.
 
-use super::knowledge::Known;
+use crate::agent::replication::knowledge::Known;
 use crate::geometry::PoseWithCovariance;
 use crate::ids::EntryId;
 use std::collections::BTreeMap;

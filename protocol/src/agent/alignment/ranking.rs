@@ -1,14 +1,15 @@
 //! Which pairs of submaps to align next, and which of them may wait: first what joins frames that nothing connects yet,
 //! then where the joint estimate knows least for the bytes it costs to know more.
 
-use super::Agent;
+use super::Prospects;
 use super::allowance::FACT_BYTES;
-use super::knowledge::{Agreement, Pair, pair_of};
 use super::negotiation::{ALIGNMENTS_PER_SUBMAP, LOOPS_PER_SUBMAP, TRIES_PER_SUBMAP_FREE, TRIES_PER_SUBMAP_TIED};
 use super::overlap_model::{OverlapFeatures, Prediction};
+use super::prospects::is_loop;
 use super::second_look;
 use super::shortlist::Candidate;
 use super::stated::Stated;
+use crate::agent::replication::knowledge::{Agreement, Pair, pair_of};
 use crate::geometry::Relative;
 use crate::ids::SubmapId;
 
@@ -46,7 +47,7 @@ pub(super) struct Proposal {
     pub further: bool,
 }
 
-impl Agent {
+impl Prospects<'_> {
     /// Candidates worth their cost, best first.
     pub(super) fn active_candidates(&self) -> Vec<Proposal> {
         let stated = self.stated();
@@ -72,7 +73,7 @@ impl Agent {
 
     /// Whether the joint estimate knows how the two submaps lie.
     pub(super) fn are_connected(&self, a: SubmapId, b: SubmapId) -> bool {
-        self.anchor(a).is_some() && self.anchor(b).is_some()
+        self.estimation.are_connected(a, b)
     }
 
     fn stated(&self) -> Stated {
@@ -92,7 +93,7 @@ impl Agent {
     /// where another alignment of theirs would say too little.
     fn gain(&self, candidate: &Candidate, stated: &Stated) -> Option<f64> {
         let pair = pair_of(candidate.mine, candidate.theirs);
-        let is_loop = self.is_loop(candidate.mine, candidate.theirs);
+        let is_loop = is_loop(candidate.mine, candidate.theirs);
         if self.is_out_of_reach(candidate.theirs) || (is_loop && self.is_out_of_reach(candidate.mine)) {
             return None;
         }
@@ -152,25 +153,25 @@ impl Agent {
 
     /// Keypoint blobs that must be sent, as far as we know, for both ends to look at a pair.
     fn blobs_lacking(&self, Candidate { mine, theirs, further, .. }: &Candidate, stated: &Stated) -> usize {
-        if self.is_loop(*mine, *theirs) {
+        if is_loop(*mine, *theirs) {
             return 0;
         }
         let blob =
             if *further { self.address_of(*theirs) } else { self.knowledge.submap(*theirs).map(|known| known.blob) };
         let is_here =
-            blob.is_some_and(|blob| self.negotiation.keypoints(blob).is_some() || self.gossip.blob(blob).is_some());
+            blob.is_some_and(|blob| self.negotiation.keypoints(blob).is_some() || self.blobs.get(blob).is_some());
         usize::from(!is_here) + usize::from(*further || stated.of_submap(*mine, theirs.frame) == 0)
     }
 
     /// The keypoints of a submap as they are sent, or the further ones, if they are here.
     fn blob_of(&self, id: SubmapId, further: bool) -> Option<&[u8]> {
         let hash = if further { self.address_of(id)? } else { self.knowledge.submap(id)?.blob };
-        self.gossip.blob(hash)
+        self.blobs.get(hash)
     }
 
     /// `t_own_anchor` by the joint estimate, if the submap is connected to us.
     pub(super) fn anchor(&self, id: SubmapId) -> Option<&Relative> {
-        self.map.solved.anchors.get(&id)
+        self.estimation.anchor(id)
     }
 }
 

@@ -1,0 +1,232 @@
+//! The robot's own side: keyframes in, submaps cut and described one at a time, so that they are stated in order; and
+//! what its sensors tell of other robots. It has no timers: all that it does is called for by an input.
+
+mod sighting;
+
+pub use sighting::{SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
+
+use super::context::Context;
+use super::io::{EpochReason, Event, JobId, Record};
+use super::job::{DescribeJob, Job};
+use super::motion::Twist;
+use super::replication::knowledge::Knowledge;
+use crate::config::SubmapConfig;
+use crate::geometry::{PoseWithCovariance, Se3};
+use crate::ids::{Hash, SubmapId};
+use crate::submap::continuity::FrameSign;
+use crate::submap::runs::Runs;
+use crate::submap::{Described, Keyframe, KeyframeError, Submap, SubmapBuilder};
+use crate::time::{Instant, Stamp};
+use crate::wire::fact::{Fact, SubmapFact};
+use core::num::NonZero;
+use core::time::Duration;
+use sighting::Positions;
+use std::collections::VecDeque;
+
+/// Finished submaps waiting to be described. Beyond it keyframes are refused: the computer is too slow for its sensor.
+pub const DESCRIBE_QUEUE_MAX: usize = 64;
+
+/// A clock that went back and stays there is one whose stamps are refused, and rise, for so many keyframes in a row and
+/// for so long. Keyframes that are only late come all at once, or between others.
+pub const CLOCK_BACK_KEYFRAMES: u32 = 8;
+const CLOCK_BACK: Duration = Duration::from_secs(10);
+
+/// Keyframes on their way to becoming submaps.
+pub(super) struct Mapping {
+    builder: SubmapBuilder,
+    behind: Option<Behind>,
+    last: Option<(Se3, Stamp)>,
+    twist: Option<Twist>,
+    queue: VecDeque<(SubmapId, Submap)>,
+    describing: Option<(JobId, SubmapId)>,
+    keyframes: u64,
+    positions: Positions,
+}
+
+/// A submap that was described.
+pub(super) struct Finished {
+    pub(super) id: SubmapId,
+    /// What is stated of it.
+    pub(super) fact: Fact,
+    /// Its keypoints as they are sent, and their address.
+    pub(super) blob: (Hash, Vec<u8>),
+    pub(super) described: Described,
+}
+
+/// Keyframes in a row that were refused because their stamps, which rise, are behind the last one taken.
+#[derive(Clone, Copy, Debug)]
+struct Behind {
+    since: Instant,
+    last: Stamp,
+    count: u32,
+}
+
+impl Mapping {
+    pub(super) fn new(config: &SubmapConfig) -> Self {
+        let builder = SubmapBuilder::new(config.clone());
+        Self {
+            builder,
+            behind: None,
+            last: None,
+            twist: None,
+            queue: VecDeque::new(),
+            describing: None,
+            keyframes: 0,
+            positions: Positions::default(),
+        }
+    }
+
+    /// A new frame: what follows has nothing to do with what came before.
+    pub(super) fn restart(&mut self, session_is_over: bool) {
+        self.builder = self.builder.begun_anew(session_is_over);
+        self.behind = None;
+        (self.last, self.twist) = (None, None);
+    }
+
+    fn taken(&mut self, pose: &Se3, stamp: Stamp) {
+        let last = self.last.replace((*pose, stamp));
+        self.twist = last.and_then(|(last, at)| Twist::between(&last, pose, stamp.secs_since(at)));
+    }
+
+    /// A keyframe with this stamp was refused as one behind. Whether the clock has gone back for good.
+    fn is_clock_back(&mut self, now: Instant, stamp: Stamp) -> bool {
+        let behind = match self.behind {
+            Some(behind) if stamp > behind.last => Behind { last: stamp, count: behind.count + 1, ..behind },
+            _ => Behind { since: now, last: stamp, count: 1 },
+        };
+        self.behind = Some(behind);
+        behind.count >= CLOCK_BACK_KEYFRAMES && now.since(behind.since) >= CLOCK_BACK
+    }
+
+    /// Submaps not yet described.
+    pub(super) fn pending(&self) -> usize {
+        self.queue.len() + usize::from(self.describing.is_some())
+    }
+
+    /// Keyframes taken.
+    pub(super) fn keyframes(&self) -> u64 {
+        self.keyframes
+    }
+
+    /// The last finished submap and the body's pose in its anchor.
+    pub(super) fn body(&self) -> Option<(u32, PoseWithCovariance, Stamp)> {
+        self.builder.body_since_anchor()
+    }
+
+    /// Whether there is room for a keyframe; if not, it is refused.
+    pub(super) fn has_room(&mut self, context: &mut Context, keyframe: &Keyframe) -> bool {
+        let has_room = self.queue.len() < DESCRIBE_QUEUE_MAX;
+        if !has_room {
+            let detail = format!("{DESCRIBE_QUEUE_MAX} submaps wait to be described; raise submap.distance_m");
+            self.builder.pass(keyframe);
+            context.reject(Some(context.robot()), "keyframe: overload", &detail);
+        }
+        has_room
+    }
+
+    /// Why a keyframe is of another frame than those before it, if it is.
+    pub(super) fn another_frame(&mut self, keyframe: &Keyframe) -> Option<EpochReason> {
+        self.builder.another_frame(keyframe).map(|sign| match sign {
+            FrameSign::Session => EpochReason::Session,
+            FrameSign::Jump => EpochReason::Jumped,
+        })
+    }
+
+    /// Takes a keyframe of the present frame, or refuses it. Why a new epoch is to begin, if one is.
+    pub(super) fn on_keyframe(&mut self, context: &mut Context, keyframe: Keyframe) -> Option<EpochReason> {
+        let (stamp, pose) = (keyframe.stamp, keyframe.pose.pose);
+        let session = self.builder.runs().now();
+        match self.builder.push(keyframe) {
+            Ok(closed) => {
+                self.behind = None;
+                self.taken(&pose, stamp);
+                self.keyframes += 1;
+                self.keep_session(context, session);
+                self.enqueue(context, closed);
+                None
+            }
+            Err(error) => {
+                context.reject(Some(context.robot()), "keyframe", &error.to_string());
+                let is_behind = matches!(error, KeyframeError::StampNotRising { .. });
+                (is_behind && self.is_clock_back(context.now(), stamp)).then_some(EpochReason::ClockBack)
+            }
+        }
+    }
+
+    /// Once it is known what the front end calls its run, that is kept for the next start: together with the first
+    /// submap of the epoch, or before.
+    fn keep_session(&mut self, context: &mut Context, before: Option<u64>) {
+        let runs = self.builder.runs();
+        if let Some(session) = runs.now().filter(|now| Some(*now) != before) {
+            let over = runs.over().collect();
+            context.keep(Record::Session { epoch: context.frame().epoch, session, over });
+        }
+    }
+
+    /// The open submap ends here.
+    pub(super) fn close_submap(&mut self, context: &mut Context) {
+        let closed = self.builder.flush();
+        self.enqueue(context, closed);
+    }
+
+    fn enqueue(&mut self, context: &mut Context, closed: Option<Submap>) {
+        if let Some(misfit_voxels) = self.builder.take_misfit() {
+            context.event(Event::ViewsDisagree { frame: context.frame(), misfit_voxels });
+        }
+        if let Some(submap) = closed {
+            let id = SubmapId { frame: context.frame(), index: submap.index };
+            self.queue.push_back((id, submap));
+        }
+    }
+
+    /// One submap is described at a time, so that facts are written in order.
+    pub(super) fn start_describing(&mut self, context: &mut Context) {
+        // Beyond the epoch limit no keyframe is taken: what waits here is of epochs that can still be written.
+        if self.describing.is_some() {
+            return;
+        }
+        if let Some((id, submap)) = self.queue.pop_front() {
+            let config = context.config().submap.clone();
+            let job = context.run_job(Job::Describe(Box::new(DescribeJob { submap, config })));
+            self.describing = Some((job, id));
+        }
+    }
+
+    /// A submap was described: what is to be stated of it, and kept.
+    pub(super) fn on_described(
+        &mut self,
+        context: &Context,
+        job: JobId,
+        (submap, described): (Submap, Described),
+    ) -> Option<Finished> {
+        let (_, id) = self.describing.take_if(|(running, _)| *running == job)?;
+        let blob = described.keypoints.encode();
+        let hash = Hash::of(&blob);
+        // The epoch may have ended meanwhile: the submap still belongs to the frame it was driven in.
+        let fact = Fact::Submap(SubmapFact {
+            index: submap.index,
+            stamps: submap.stamps,
+            odometry: submap.odometry,
+            extent: described.extent,
+            summary: described.summary.encode(),
+            keypoint_count: u16::try_from(described.keypoints.len()).unwrap_or(u16::MAX),
+            blob: hash,
+            scale: context.config().submap.scale,
+            keyframes: u16::try_from(submap.keyframes.len()).ok().and_then(NonZero::new),
+        });
+        Some(Finished { id, fact, blob: (hash, blob), described })
+    }
+
+    /// After a restart: the trajectory goes on from the last submap that is durable, if the front end's run does.
+    pub(super) fn resume(&mut self, context: &Context, knowledge: &Knowledge, runs: Runs) {
+        let mut t_frame_anchor = None;
+        let mut next_index = 0;
+        let chain = knowledge.chains().remove(&context.frame()).unwrap_or_default();
+        for index in chain {
+            let Some(known) = knowledge.submap(SubmapId { frame: context.frame(), index }) else { break };
+            next_index = index + 1;
+            t_frame_anchor = Some(t_frame_anchor.unwrap_or_else(Se3::identity) * known.t_prev_this);
+        }
+        self.builder = SubmapBuilder::resume(context.config().submap.clone(), next_index, t_frame_anchor, runs);
+    }
+}
