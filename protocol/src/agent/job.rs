@@ -1,7 +1,7 @@
 //! Heavy work as a value: a pure function of its data, run by the shell wherever it likes. The simulator runs jobs
 //! inline and charges virtual time by [`Job::kind`]; a replay runs them again instead of storing their results.
 
-use super::replication::two_sided;
+use super::two_sided;
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
 use crate::estimate::extrapolation::End;

@@ -21,6 +21,7 @@ mod replication;
 mod restore;
 mod router;
 mod stats;
+mod two_sided;
 mod view;
 
 use crate::config::{Config, ConfigError};
@@ -86,8 +87,7 @@ pub struct Restored {
     pub fresh_epoch: u32,
 }
 
-/// One robot's agent: four parts, each of which alone touches what it holds and has its own timers, and a
-/// [router](self::router) between them.
+/// One robot's agent: four parts, each of which alone touches what it holds, and a router between them.
 pub struct Agent {
     context: Context,
     replication: Replication,

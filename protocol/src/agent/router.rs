@@ -2,7 +2,7 @@
 
 use super::Agent;
 use super::alignment::Sources;
-use super::estimation::live;
+use super::estimation::live_robots;
 use super::io::{AskToken, Channel, EpochReason, Event, JobId, PositionSighting, QueryId, QueryKind, Record, Sighting};
 use super::job::JobResult;
 use super::mapping::Finished;
@@ -171,7 +171,7 @@ impl Agent {
     pub(super) fn start_solving(&mut self) {
         let now = self.context.now();
         if self.estimation.is_due(now) {
-            let robots = live(&self.context, self.mapping.body(), self.replication.beacons(), now);
+            let robots = live_robots(&self.context, self.mapping.body(), self.replication.beacons(), now);
             self.estimation.start(&mut self.context, &self.replication, &robots);
         }
     }

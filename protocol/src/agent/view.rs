@@ -3,7 +3,7 @@
 
 use super::Agent;
 use super::alignment::Sources;
-use super::estimation::{estimate_version, live, pair_views, robot_view};
+use super::estimation::{estimate_version, live_robots, pair_views, robot_view};
 use super::replication::knowledge::Agreement;
 use crate::estimate::EdgeKind;
 use crate::estimate::joint::Shortfall;
@@ -140,7 +140,7 @@ impl Agent {
     }
 
     fn poses_view(&self, now: Instant) -> PosesView {
-        let live = live(&self.context, self.mapping.body(), self.replication.beacons(), now);
+        let live = live_robots(&self.context, self.mapping.body(), self.replication.beacons(), now);
         let robots = live.iter().map(|one| robot_view(&self.context, &self.estimation, one)).collect();
         PosesView { robots, pairs: pair_views(&self.context, &self.estimation, &live) }
     }

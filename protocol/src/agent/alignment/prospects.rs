@@ -48,7 +48,7 @@ impl Prospects<'_> {
         Verticals::of(up(theirs), up(mine))
     }
 
-    /// The keypoints that pairs still need: of those that are active, the ones that have not begun, and of answers owed.
+    /// The keypoints that pairs still need: of active ones those that have not begun, and of answers owed.
     pub(super) fn blobs_needed(&self, active: &[Proposal]) -> BTreeSet<Hash> {
         let waits = |c: &&Proposal| c.further || !self.negotiation.is_tried(pair_of(c.mine, c.theirs));
         let mut wanted: BTreeSet<SubmapId> = active.iter().filter(waits).flat_map(|c| [c.mine, c.theirs]).collect();

@@ -14,7 +14,7 @@ use super::overlap_model::Prediction;
 use super::ranking::DRIFT_SIGMAS;
 use super::shortlist::Candidate;
 use crate::agent::replication::knowledge::pair_of;
-use crate::agent::replication::two_sided;
+use crate::agent::two_sided;
 use crate::geometry::Relative;
 use crate::ids::{Hash, SubmapId};
 use crate::submap::Keypoints;

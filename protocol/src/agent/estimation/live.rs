@@ -33,7 +33,12 @@ pub(in crate::agent) struct Live {
 }
 
 /// Every robot whose pose is known, this one first; the others ascend.
-pub(in crate::agent) fn live(context: &Context, body: Option<Body>, beacons: &Beacons, now: Instant) -> Vec<Live> {
+pub(in crate::agent) fn live_robots(
+    context: &Context,
+    body: Option<Body>,
+    beacons: &Beacons,
+    now: Instant,
+) -> Vec<Live> {
     let own = body.map(|(index, t_anchor_body, stamp)| {
         let anchor = SubmapId { frame: context.frame(), index };
         Live { robot: context.robot(), anchor, t_anchor_body, age_secs: 0.0, stamp_secs: stamp.as_secs_f64() }

@@ -6,7 +6,7 @@ mod live;
 mod steps;
 
 pub use live::ROBOTS_ALL_PAIRS_MAX;
-pub(super) use live::{Live, live, pair_views, robot_view};
+pub(super) use live::{Live, live_robots, pair_views, robot_view};
 
 use super::context::Context;
 use super::io::{Event, JobId};

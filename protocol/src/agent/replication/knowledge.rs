@@ -1,7 +1,7 @@
 //! What the facts say, independent of the order they came in: the submaps, which alignments both endpoints agree on
 //! (the two-sided rule, DESIGN §3), and the estimation problem that follows from them.
 
-use super::two_sided;
+use crate::agent::two_sided;
 use crate::estimate::distortion::{COMMON_BENT, COMMON_LIDAR};
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
 use crate::estimate::position::{SeenPoint, StatedPoint};

@@ -13,7 +13,6 @@ mod gossip;
 pub(super) mod knowledge;
 mod ledger;
 mod traffic;
-pub(super) mod two_sided;
 
 pub use blobs::BLOBS_MAX;
 pub use condensing::GONE_IN_A_ROW_MAX;
