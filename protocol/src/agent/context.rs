@@ -1,5 +1,5 @@
-//! What all parts of an agent share: who it is, its options, the present moment, its numbers and counters, and the way
-//! out. Each part says through it what is to be sent, run, kept and told; nothing is read back from here but that.
+//! What all parts of an agent share: who it is, its options, the present moment, its numbers and counters, and the one
+//! way out, by which each part says what is to be sent, run, kept and told.
 
 use super::io::{Event, JobId, Output, QueryId, Record};
 use super::job::Job;
