@@ -28,7 +28,7 @@ pub enum Kind {
     SevenScenes,
     /// `graph.txt` and `NNNNNN/points.bin`, or `NNNNNN.bin` and `poses.txt`.
     Lidar,
-    /// One `*.clf` or `*.clf.bz2`: a planar laser's log.
+    /// One `*.clf`, `*.clf.bz2` or `*.clf.xz`: a planar laser's log.
     Carmen,
     /// `RobotN_Odometry.dat`, `RobotN_Measurement.dat` (or packed, `.xz`) and `Barcodes.dat`: robots among landmarks.
     Mrclam,
@@ -64,7 +64,7 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     }
     let why = format!(
         "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \
-         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf, *.clf.bz2), or MRCLAM logs \
+         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf, *.clf.bz2, *.clf.xz), or MRCLAM logs \
          (RobotN_Odometry.dat)",
         import_rgbd::DEPTH_SUFFIX,
         import_lidar::GRAPH,
@@ -73,12 +73,22 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     Err(Problem::Data(why).of(folder))
 }
 
+/// What became of a folder.
+#[derive(Clone, Debug)]
+pub struct Prepared {
+    /// One per robot, sorted by the robots' names, which differ.
+    pub recordings: Vec<Recording>,
+    /// What was amiss with the data and could be mended, a sentence each; for whoever gave them.
+    pub remarks: Vec<String>,
+}
+
 /// Opens the recordings in `data`, or makes them from it in `out` (a folder per robot) with drift from `seed`.
-/// Sorted by the robots' names, which differ; two to [`ROBOTS_MAX`].
+/// There are two to [`ROBOTS_MAX`].
 ///
 /// # Errors
 /// [`RecordingError`] for the first problem.
-pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Vec<Recording>, RecordingError> {
+pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Prepared, RecordingError> {
+    let mut remarks = Vec::new();
     let folder = match detect(data)? {
         Kind::Recordings => data,
         Kind::SevenScenes => {
@@ -90,7 +100,7 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Vec<Recording>, Rec
             out
         }
         Kind::Carmen => {
-            import_laser::import(data, out)?;
+            remarks = import_laser::import(data, out)?;
             out
         }
         Kind::Mrclam => {
@@ -98,7 +108,7 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Vec<Recording>, Rec
             out
         }
     };
-    open_all(folder)
+    Ok(Prepared { recordings: open_all(folder)?, remarks })
 }
 
 /// Opens every recording in the sub-folders of `folder`.

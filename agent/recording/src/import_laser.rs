@@ -1,12 +1,15 @@
-//! A CARMEN log (`*.clf`, or packed `*.clf.bz2`) becomes three planar robots with its real odometry. Each drives a
-//! stretch of the way, the stretches overlap, and each is given every third scan: two robots never hold the same one.
+//! A CARMEN log (`*.clf`, perhaps packed as `*.clf.bz2` or `*.clf.xz`) becomes three planar robots with its real
+//! odometry. Each drives a stretch of the way, the stretches overlap, and two robots never hold the same scan: of a log
+//! with many scans to a metre each robot is given every third, of any other all of its stretch, alternately where
+//! another robot drives, too.
 
 use super::Writer;
 use super::cloud::read_bytes;
 use super::error::{Problem, RecordingError, on};
 use super::import::NAMES;
-use crate::carmen::{Parser, Scan, keyframes};
+use crate::carmen::{Log, Parser, Scan, keyframes};
 use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
+use core::ops::Range;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::ids::Name;
 use merganser_protocol::submap::CovarianceOf;
@@ -14,16 +17,20 @@ use std::io::{Cursor, Read};
 use std::path::Path;
 
 /// How the names of logs end.
-pub(super) const SUFFIXES: [&str; 2] = [".clf", ".clf.bz2"];
+pub(super) const SUFFIXES: [&str; 3] = [".clf", ".clf.bz2", ".clf.xz"];
 /// Bytes of an unpacked log at most.
 const LOG_BYTES_MAX: u64 = 512_000_000;
 /// Robots made.
 const ROBOTS: usize = 3;
 /// Share of the log by which a robot's stretch reaches into each neighbour's.
 const REACH: f64 = 0.1;
+/// Every third scan is enough for a robot where they lie so far apart at most, in the mean, m.
+const APART_MAX_M: f64 = 0.5;
+/// A submap may take as long as it likes, s: wheels drift by the way, and the stamps of some logs only count scans.
+const SECS_MAX: f64 = 1e6;
 
-/// Writes three recordings into `out`.
-pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
+/// Writes three recordings into `out`, and returns what there is to say of the log.
+pub(super) fn import(data: &Path, out: &Path) -> Result<Vec<String>, RecordingError> {
     let mut logs = Vec::new();
     for entry in on(data, data.read_dir())? {
         let path = on(data, entry)?.path();
@@ -37,23 +44,21 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
         let why = format!("holds {} CARMEN logs; one log at a time can be cut into robots", logs.len());
         return Err(Problem::Data(why).of(data));
     };
-    let scans = read_log(log)?;
+    let log = read_log(log)?;
     let mut config = Config::default();
     config.submap.sensor = Sensor::Laser2d;
     config.submap.distance_m = 6.0;
     // Never by rotation: a submap that shows a place from all sides is recognised better.
     config.submap.rotation_deg = 360.0;
     config.submap.keyframes_max = 32;
+    config.submap.secs_max = SECS_MAX;
+    let dealt = deal(&log.scans);
     for (robot, name) in NAMES.iter().enumerate().take(ROBOTS) {
         let folder = out.join(name);
         // What an earlier run left must not pass for part of this one.
         if folder.exists() {
             on(&folder, std::fs::remove_dir_all(&folder))?;
         }
-        let share = |k: f64| ((k.clamp(0.0, 1.0) * scans.len() as f64) as usize).min(scans.len());
-        let from = share(robot as f64 / ROBOTS as f64 - REACH);
-        let to = share((robot + 1) as f64 / ROBOTS as f64 + REACH);
-        let own = (from..to).filter(|k| k % ROBOTS == robot).map(|k| &scans[k]);
         let manifest = Manifest {
             format: FORMAT.into(),
             version: VERSION,
@@ -66,44 +71,109 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<(), RecordingError> {
             begins_ns: None,
             places: None,
             origin: format!(
-                "CARMEN log of {} scans, real odometry; every third scan from {from} to {to} (counted from 0)",
-                scans.len()
+                "CARMEN log of {} scans ({} late, {} repeated), real odometry; {}",
+                log.scans.len(),
+                log.late,
+                log.repeated,
+                dealt.how(robot)
             ),
             config: config.clone(),
         };
         let mut writer = Writer::create(&folder, manifest)?;
-        for keyframe in keyframes(own) {
+        for keyframe in keyframes(dealt.of(robot).map(|k| &log.scans[k])) {
             writer.push(&keyframe, None)?;
         }
         writer.finish()?;
     }
-    Ok(())
+    Ok(remarks(&log))
 }
 
-/// The scans of a log, at least one for each robot.
-fn read_log(path: &Path) -> Result<Vec<Scan>, RecordingError> {
-    let mut bytes = read_bytes(path)?;
-    if path.extension().is_some_and(|extension| extension == "bz2") {
-        let mut unpacked = Vec::new();
-        let packed = bzip2::read::MultiBzDecoder::new(Cursor::new(bytes));
-        on(path, packed.take(LOG_BYTES_MAX + 1).read_to_end(&mut unpacked))?;
-        bytes = unpacked;
+/// How the scans of a log are dealt out to the robots.
+struct Deal {
+    /// Of scans, in all.
+    count: usize,
+    /// Every robot has only its turn's scans of its stretch, not all that no other robot's stretch holds.
+    in_turn: bool,
+}
+
+/// As close together as the log has them: the way by odometry tells.
+fn deal(scans: &[Scan]) -> Deal {
+    let way: f64 = scans.windows(2).map(|two| (two[1].pose.translation - two[0].pose.translation).norm()).sum();
+    let count = scans.len();
+    Deal { count, in_turn: way * ROBOTS as f64 <= APART_MAX_M * count as f64 }
+}
+
+impl Deal {
+    /// The scans of a robot's stretch, with those that others are given.
+    fn stretch(&self, robot: usize) -> Range<usize> {
+        let share = |k: f64| ((k.clamp(0.0, 1.0) * self.count as f64) as usize).min(self.count);
+        share(robot as f64 / ROBOTS as f64 - REACH)..share((robot + 1) as f64 / ROBOTS as f64 + REACH)
     }
+
+    /// The scans that a robot is given.
+    fn of(&self, robot: usize) -> impl Iterator<Item = usize> {
+        self.stretch(robot).filter(move |&k| {
+            let drive_here = |other: &usize| self.in_turn || self.stretch(*other).contains(&k);
+            let robots: Vec<usize> = (0..ROBOTS).filter(drive_here).collect();
+            robots[k % robots.len()] == robot
+        })
+    }
+
+    fn how(&self, robot: usize) -> String {
+        let Range { start, end } = self.stretch(robot);
+        let which =
+            if self.in_turn { "every third scan" } else { "the scans, alternately where another robot drives," };
+        format!("{which} from {start} to {end} (counted from 0)")
+    }
+}
+
+/// What was amiss with a log, and what was done about it.
+fn remarks(log: &Log) -> Vec<String> {
+    let Log { scans, late, repeated } = log;
+    let all = scans.len() + repeated;
+    let mut remarks = Vec::new();
+    if *late > 0 {
+        remarks.push(format!(
+            "{late} of {all} scans stand behind a later one in the log; they are sorted by their stamps"
+        ));
+    }
+    if *repeated > 0 {
+        remarks
+            .push(format!("{repeated} of {all} scans have the stamp of one before them in the log; they are left out"));
+    }
+    remarks
+}
+
+/// A log, of at least one scan for each robot.
+fn read_log(path: &Path) -> Result<Log, RecordingError> {
+    let bytes = read_bytes(path)?;
+    let bytes = match path.extension().and_then(|extension| extension.to_str()) {
+        Some("bz2") => unpacked(path, bzip2::read::MultiBzDecoder::new(Cursor::new(bytes)))?,
+        Some("xz") => unpacked(path, lzma_rust2::XzReader::new(Cursor::new(bytes), true))?,
+        _ => bytes,
+    };
     if bytes.len() as u64 > LOG_BYTES_MAX {
         return Err(Problem::Data(format!("is longer than {LOG_BYTES_MAX} bytes; cut the log")).of(path));
     }
     let mut parser = Parser::default();
     for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
         let text = std::str::from_utf8(line).map_err(|_| {
-            Problem::Data("is no text; a CARMEN log holds plain text, packed ones end in .bz2".into())
+            Problem::Data("is no text; a CARMEN log holds plain text, packed ones end in .bz2 or .xz".into())
                 .at(path, index + 1)
         })?;
         parser.line(text).map_err(|error| Problem::Data(error.what.to_string()).at(path, error.line))?;
     }
-    let scans = parser.finish();
-    if scans.len() < ROBOTS {
-        let why = format!("holds {} FLASER scans; {ROBOTS} robots need at least one each", scans.len());
+    let log = parser.finish();
+    if log.scans.len() < ROBOTS {
+        let why =
+            format!("holds {} scans (FLASER or ROBOTLASER1); {ROBOTS} robots need at least one each", log.scans.len());
         return Err(Problem::Data(why).of(path));
     }
-    Ok(scans)
+    Ok(log)
+}
+
+fn unpacked(path: &Path, packed: impl Read) -> Result<Vec<u8>, RecordingError> {
+    let mut bytes = Vec::new();
+    on(path, packed.take(LOG_BYTES_MAX + 1).read_to_end(&mut bytes))?;
+    Ok(bytes)
 }

@@ -172,7 +172,7 @@ mod tests {
         let (data, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         write_good(data.path());
         assert_eq!(detect(data.path()).unwrap(), Kind::Mrclam);
-        let recordings = prepare(data.path(), out.path(), 1).unwrap();
+        let recordings = prepare(data.path(), out.path(), 1).unwrap().recordings;
         assert_eq!(recordings.iter().map(|r| r.manifest().robot.as_str()).collect::<Vec<_>>(), ["robot1", "robot2"]);
         recordings.iter().try_for_each(Recording::check_clouds).unwrap();
         let keyframe = recordings[0].keyframe(5).unwrap();

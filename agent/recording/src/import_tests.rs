@@ -6,6 +6,7 @@ use super::error::RecordingError;
 use super::import::{Kind, detect, prepare};
 use std::fmt::Write as _;
 use std::fs::{self, File};
+use std::io::Write as _;
 use std::path::Path;
 use tempfile::TempDir;
 
@@ -17,7 +18,7 @@ fn imported(write: fn(&Path), spoil: impl FnOnce(&Path)) -> Result<(Kind, Vec<Re
     let (data, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     write(data.path());
     spoil(data.path());
-    let recordings = prepare(data.path(), out.path(), 1)?;
+    let recordings = prepare(data.path(), out.path(), 1)?.recordings;
     recordings.iter().try_for_each(Recording::check_clouds)?;
     Ok((detect(data.path())?, recordings, out))
 }
@@ -71,11 +72,16 @@ fn kitti(data: &Path) {
     fs::write(data.join("poses.txt"), poses).unwrap();
 }
 
-/// A robot that drives straight on between two walls.
+/// A robot that drives straight on between two walls, a scan each 0.1 m.
 fn carmen(data: &Path) {
+    corridor(data, 60, 0.1);
+}
+
+/// The same with so many scans so far apart, m; stamps are 1000 s and a second for each scan.
+fn corridor(data: &Path, scans: u32, apart: f64) {
     let mut log = String::from("PARAM robot_frontlaser_offset 0.0\n");
-    for k in 0..60 {
-        let x = 0.1 * f64::from(k);
+    for k in 0..scans {
+        let x = apart * f64::from(k);
         let _ = write!(log, "FLASER 19");
         (0..19).for_each(|n| {
             let _ = write!(log, " {:.2}", 2.0 / (0.2 + f64::from(n) * 0.17).sin().abs().max(0.2));
@@ -189,18 +195,65 @@ fn bad_scans_and_their_poses_are_told() {
     assert!(text.contains("state the pose of each scan in poses.txt"), "{text}");
 }
 
+/// Seconds of each robot's stamps after 1000.
+fn seconds(recordings: &[Recording]) -> Vec<Vec<i64>> {
+    let of = |r: &Recording| r.keyframes().iter().map(|line| line.stamp.0 / 1_000_000_000 - 1000).collect();
+    recordings.iter().map(of).collect()
+}
+
 #[test]
 fn a_lasers_log_becomes_three_robots_that_share_no_scan() {
-    let (kind, recordings, _out) = imported(carmen, |_| {}).unwrap();
+    let (kind, recordings, _out) = imported(|data| corridor(data, 61, 0.1), |_| {}).unwrap();
     assert_eq!(kind, Kind::Carmen);
-    let mut stamps = Vec::new();
-    for recording in &recordings {
-        stamps.extend((0..recording.len()).map(|k| recording.keyframe(k).unwrap().stamp));
-    }
-    let all = stamps.len();
-    stamps.sort();
-    stamps.dedup();
-    assert!(recordings.len() == 3 && all >= 12 && stamps.len() == all, "{all} keyframes, {} stamps", stamps.len());
+    // Of 61 scans every third within a third and a tenth to either side: 0.3 m apart, each a keyframe.
+    let expected = |from: i64, to: i64| (from..to).step_by(3).collect::<Vec<_>>();
+    assert_eq!(seconds(&recordings), [expected(0, 26), expected(16, 46), expected(35, 61)]);
+}
+
+#[test]
+fn of_a_log_of_few_scans_a_robot_is_given_its_whole_stretch() {
+    let (_, recordings, _out) = imported(|data| corridor(data, 61, 1.0), |_| {}).unwrap();
+    let [alpha, beta, gamma]: [Vec<i64>; 3] = seconds(&recordings).try_into().unwrap();
+    let alternately = |from: i64, to: i64, odd: i64| (from..to).filter(move |k| k % 2 == odd).collect::<Vec<_>>();
+    assert_eq!(alpha, [(0..14).collect(), alternately(14, 26, 0)].concat());
+    assert_eq!(beta, [alternately(14, 26, 1), (26..34).collect(), alternately(34, 46, 0)].concat());
+    assert_eq!(gamma, [alternately(34, 46, 1), (46..61).collect()].concat());
+}
+
+#[test]
+fn a_log_out_of_order_is_sorted_and_that_is_told() {
+    let (data, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    carmen(data.path());
+    let prepared = prepare(data.path(), out.path(), 1).unwrap();
+    assert!(prepared.remarks.is_empty(), "{:?}", prepared.remarks);
+    let log = data.path().join("corridor.clf");
+    let straight = fs::read_to_string(&log).unwrap();
+    let mut lines: Vec<&str> = straight.lines().collect();
+    lines.swap(20, 21);
+    lines.push(lines[5]);
+    fs::write(&log, lines.join("\n")).unwrap();
+    let again = prepare(data.path(), out.path(), 1).unwrap();
+    assert_eq!(seconds(&again.recordings), seconds(&prepared.recordings));
+    let [late, repeated] = again.remarks.as_slice() else { panic!("{:?}", again.remarks) };
+    assert!(late.starts_with("2 of 61 scans stand behind a later one"), "{late}");
+    assert!(repeated.starts_with("1 of 61 scans have the stamp of one before"), "{repeated}");
+    let origin = &again.recordings[0].manifest().origin;
+    assert!(origin.contains("60 scans (2 late, 1 repeated)"), "{origin}");
+}
+
+#[test]
+fn a_packed_log_is_the_same_log() {
+    let (_, plain, _out) = imported(carmen, |_| {}).unwrap();
+    let pack = |d: &Path| {
+        let log = d.join("corridor.clf");
+        let file = File::create(d.join("corridor.clf.xz")).unwrap();
+        let mut packer = lzma_rust2::XzWriter::new(file, lzma_rust2::XzOptions::with_preset(1)).unwrap();
+        packer.write_all(&fs::read(&log).unwrap()).unwrap();
+        packer.finish().unwrap();
+        fs::remove_file(log).unwrap();
+    };
+    let (kind, packed, _out) = imported(carmen, pack).unwrap();
+    assert_eq!((kind, seconds(&packed)), (Kind::Carmen, seconds(&plain)));
 }
 
 #[test]
@@ -211,14 +264,16 @@ fn bad_laser_logs_are_told_with_their_line() {
     let (_, line, text) = refused(carmen, |d| edit(&log(d), " 1000 robot", " inf robot"));
     assert!(line == Some(2) && text.contains("no usable number"), "{text}");
     let (_, _, text) = refused(carmen, |d| fs::write(log(d), "").unwrap());
-    assert!(text.contains("holds 0 FLASER scans"), "{text}");
+    assert!(text.contains("holds 0 scans"), "{text}");
     let (_, _, text) = refused(carmen, |d| fs::write(log(d), [0xff, 0xfe]).unwrap());
     assert!(text.contains("is no text"), "{text}");
     let (_, _, text) = refused(carmen, |d| fs::copy(log(d), d.join("other.clf")).map(drop).unwrap());
     assert!(text.contains("one log at a time"), "{text}");
-    let (file, _, text) = refused(carmen, |d| {
-        fs::remove_file(log(d)).unwrap();
-        fs::write(d.join("packed.clf.bz2"), b"not packed").unwrap();
-    });
-    assert!(file == "packed.clf.bz2", "{text}");
+    for name in ["packed.clf.bz2", "packed.clf.xz"] {
+        let (file, _, text) = refused(carmen, |d| {
+            fs::remove_file(log(d)).unwrap();
+            fs::write(d.join(name), b"not packed").unwrap();
+        });
+        assert!(file == name, "{text}");
+    }
 }

@@ -294,7 +294,7 @@ fn lidar_scans_of_both_kinds_are_cut_into_robots() {
     fs::write(kitti.path().join("poses.txt"), &poses).unwrap();
     for folder in [dump.path(), kitti.path()] {
         assert_eq!(detect(folder).unwrap(), Kind::Lidar);
-        let recordings = prepare(folder, out.path(), 1).unwrap();
+        let recordings = prepare(folder, out.path(), 1).unwrap().recordings;
         assert_eq!(recordings.iter().map(Recording::len).collect::<Vec<_>>(), [2, 3]);
         assert_eq!(recordings[1].truth().unwrap()[2].pose.translation.x, 4.0);
         assert_eq!(recordings[1].keyframe(2).unwrap().points, points);
@@ -325,7 +325,7 @@ fn shared(path: &str) -> Option<PathBuf> {
 fn seven_scenes_become_three_robots() {
     let Some(data) = shared("rgbd_7scenes") else { return };
     let out = tempfile::tempdir().unwrap();
-    let recordings = prepare(&data, out.path(), 1).unwrap();
+    let recordings = prepare(&data, out.path(), 1).unwrap().recordings;
     assert_eq!(recordings.iter().map(Recording::len).collect::<Vec<_>>(), [33, 33, 34]);
     for recording in &recordings {
         assert!(recording.manifest().origin.contains("seed 1"), "{}", recording.manifest().origin);
@@ -356,7 +356,7 @@ fn seven_scenes_become_three_robots() {
 fn a_lidar_dump_becomes_two_robots() {
     let Some(data) = shared("lidar_gtsam_points/kitti_07_dump") else { return };
     let out = tempfile::tempdir().unwrap();
-    let recordings = prepare(&data, out.path(), 1).unwrap();
+    let recordings = prepare(&data, out.path(), 1).unwrap().recordings;
     assert_eq!(recordings.iter().map(Recording::len).collect::<Vec<_>>(), [2, 3]);
     assert!(recordings[0].keyframe(0).unwrap().points.len() > 10_000);
 }

@@ -20,7 +20,7 @@ mod tests;
 use crate::commands::{runtime, say};
 use crate::config::{LogConfig, LogFormat};
 use crate::recording::Recording;
-use crate::recording::import::{self, Kind};
+use crate::recording::import::{self, Kind, Prepared};
 use crate::telemetry;
 use anyhow::{Context, Result, bail};
 use evaluate::{Bounds, Evaluation};
@@ -148,7 +148,10 @@ fn prepare(args: &DemoArgs, work: &Path) -> Result<(Vec<Recording>, Bounds)> {
         bundle::unpack(&folder)?;
         return Ok((import::open_all(&folder)?, default));
     };
-    let recordings = import::prepare(data, &folder, args.seed)?;
+    let Prepared { recordings, remarks } = import::prepare(data, &folder, args.seed)?;
+    for remark in remarks {
+        let _ = console::Term::stderr().write_line(&format!("merganser: {}: {remark}", data.display()));
+    }
     recordings.iter().try_for_each(Recording::check_clouds)?;
     let bounds = match import::detect(data)? {
         Kind::Recordings => {

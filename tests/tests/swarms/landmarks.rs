@@ -111,7 +111,7 @@ fn five_robots_agree_with_the_survey() {
 fn agree_with_the_survey(robots: core::ops::Range<usize>, positions_min: usize) {
     let Some(data) = real_data("mrclam_dataset1") else { return };
     let out = tempfile::tempdir().unwrap();
-    let recordings: Vec<Recording> = prepare(&data, out.path(), 1).unwrap().drain(robots).collect();
+    let recordings: Vec<Recording> = prepare(&data, out.path(), 1).unwrap().recordings.drain(robots).collect();
     let survey = [false, true].map(|exchanged| survey(&data, exchanged));
     let names: Vec<&str> = recordings.iter().map(|r| r.manifest().robot.as_str()).collect();
     let all: Vec<Vec<Submap>> = recordings.iter().map(submaps).collect();

@@ -90,7 +90,7 @@ fn three_robots_merge_on_a_real_planar_laser() {
 fn robots_merge(robots: usize) {
     let Some(data) = real_data("lidar2d_radish") else { return };
     let out = tempfile::tempdir().unwrap();
-    let mut recordings = prepare(&data, out.path(), 1).unwrap();
+    let mut recordings = prepare(&data, out.path(), 1).unwrap().recordings;
     recordings.truncate(robots);
     let wires = play(&recordings, 1).unwrap();
     let Snapshot { status, frames, map, graph, stats, .. } = wires.agents[0].snapshot(wires.now);

@@ -20,7 +20,7 @@ const DEMO_SEED: u64 = 1;
 
 fn merge(data: &Path, seed: u64) -> Evaluation {
     let out = tempfile::tempdir().unwrap();
-    let recordings = prepare(data, out.path(), seed).unwrap();
+    let recordings = prepare(data, out.path(), seed).unwrap().recordings;
     let wires = play(&recordings, seed).unwrap();
     let tracks: Vec<Track> = recordings.iter().map(Track::of).collect();
     let views = |agent: &Agent| {

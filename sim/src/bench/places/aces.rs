@@ -82,7 +82,7 @@ impl Way {
         bzip2::read::MultiBzDecoder::new(std::io::BufReader::new(packed)).read_to_string(&mut text)?;
         let mut parser = Parser::default();
         text.lines().try_for_each(|line| parser.line(line)).with_context(|| log.display().to_string())?;
-        let scans = parser.finish();
+        let scans = parser.finish().scans;
         let keyframes = keyframes(scans.iter().step_by(EVERY));
         let scans = scans.iter().map(|scan| (scan.stamp.0, scan.pose)).collect();
         let mut builder = SubmapBuilder::new(config.clone());
