@@ -5,11 +5,12 @@
 
 use super::distortion;
 use super::drift_model::DriftModel;
-use super::graph::{Disjoint, Factor, Label, content_order, is_usable};
+use super::graph::{Disjoint, Factor, content_order, is_usable};
 use super::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Unused};
+use super::node::{Label, Node};
 use super::odometry_correlation::Around;
 use super::position::{DIMENSION, StatedPoint};
-use super::solve::SolveError;
+use super::solve::{ComponentError, SolveError};
 use super::trajectory::Trajectory;
 use crate::geometry::{Covariance, Disagreement, PoseWithCovariance, Relative, So3, chi2};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -182,14 +183,16 @@ impl Admission {
 
     /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst, or, where
     /// there is too little memory, of the one with the most edges; whether any counted until now.
-    pub(super) fn isolate_worst(&mut self, frames: &BTreeSet<FrameId>, error: SolveError) -> bool {
+    pub(super) fn isolate_worst(&mut self, frames: &BTreeSet<FrameId>, error: ComponentError<Node>) -> bool {
         let counts =
             |e: &EdgeEstimate, f: FrameId| e.is_used() && [e.measurement.i.frame, e.measurement.j.frame].contains(&f);
         let tied = frames.iter().filter(|&&f| self.edges.iter().any(|e| counts(e, f)));
         let spread = |f: &FrameId| self.chains.get(f).map_or(f64::INFINITY, Chain::spread);
         let ties = |f: &FrameId| self.edges.iter().filter(|e| counts(e, *f)).count();
         let worst = match error {
-            SolveError::TooDense { .. } | SolveError::OutOfMemory => tied.max_by_key(|f| ties(f)),
+            ComponentError::Solve(SolveError::TooDense { .. } | SolveError::OutOfMemory) => {
+                tied.max_by_key(|f| ties(f))
+            }
             _ => tied.max_by(|x, y| spread(x).total_cmp(&spread(y))),
         };
         let Some(&worst) = worst else { return false };
@@ -378,11 +381,11 @@ impl Chain {
         (0..self.len() as u32).map(move |index| SubmapId { frame, index })
     }
 
-    pub(super) fn factors(&self, frame: FrameId) -> impl Iterator<Item = Factor> + '_ {
+    pub(super) fn factors(&self, frame: FrameId) -> impl Iterator<Item = Factor<Node>> + '_ {
         (1u32..).zip(&self.steps).map(move |(index, step)| Factor {
             label: Label::Odometry,
-            i: SubmapId { frame, index: index - 1 },
-            j: SubmapId { frame, index },
+            i: Node::Anchor(SubmapId { frame, index: index - 1 }),
+            j: Node::Anchor(SubmapId { frame, index }),
             t_i_j: Relative::Metric(*step),
             weight: 1.0,
         })

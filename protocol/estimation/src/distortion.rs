@@ -25,8 +25,9 @@
 //! on from the map by [`ends`](super::extrapolation).
 
 use super::admission::Kind;
-use super::graph::{Factor, Label};
+use super::graph::Factor;
 use super::joint::EdgeEstimate;
+use super::node::{Label, Node};
 use super::odometry_correlation::{self, Around, Gains};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
 use crate::ids::{FrameId, SubmapId};
@@ -40,9 +41,6 @@ pub const COMMON_MAX: f64 = 0.45;
 pub const COMMON_BENT: f64 = COMMON_MAX;
 /// That of submaps that a LiDAR saw, which bends nothing: the noise of their own points.
 pub const COMMON_LIDAR: f64 = 0.2;
-
-/// Marks the node of a submap's cloud; no frame has so many submaps.
-const CLOUD: u32 = 1 << 31;
 
 /// By how much an alignment's variance is to grow where alignments are taken as independent.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -62,20 +60,6 @@ impl Default for Charges {
 /// A share that alignments may have in common; one that is no number is none.
 pub(super) fn bounded(common: f64) -> f64 {
     if common.is_nan() { 0.0 } else { common.clamp(0.0, COMMON_MAX) }
-}
-
-/// Whether a node is a cloud.
-pub(super) fn is_cloud(id: SubmapId) -> bool {
-    id.index >= CLOUD
-}
-
-/// The anchor of a cloud; an anchor is its own.
-pub(super) fn anchor_of(id: SubmapId) -> SubmapId {
-    SubmapId { index: id.index & !CLOUD, ..id }
-}
-
-fn cloud_of(id: SubmapId) -> SubmapId {
-    SubmapId { index: id.index | CLOUD, ..id }
 }
 
 /// Sets every alignment's charges, from all that may count.
@@ -104,7 +88,7 @@ pub(super) fn charge(edges: &mut [EdgeEstimate]) {
 pub(super) fn factors<'a>(
     edges: &[&EdgeEstimate],
     odometry: impl Fn(SubmapId) -> Option<Around<'a>>,
-) -> (Vec<Factor>, BTreeMap<SubmapId, Gains>) {
+) -> (Vec<Factor<Node>>, BTreeMap<SubmapId, Gains>) {
     let shared: Vec<Option<Shared>> = edges.iter().map(|edge| Shared::of(edge)).collect();
     let clouds = clouds(edges, &shared);
     let mut gains = BTreeMap::new();
@@ -115,7 +99,7 @@ pub(super) fn factors<'a>(
         gains.insert(*id, of_steps);
         cloud_factor(*id, &covariance)
     };
-    let mut factors: Vec<Factor> = clouds.iter().map(cloud).collect();
+    let mut factors: Vec<Factor<Node>> = clouds.iter().map(cloud).collect();
     let one = |(edge, shared): (&&EdgeEstimate, &Option<Shared>)| match shared {
         None => edge.factor(),
         Some(shared) => shared.factor(edge.factor(), &clouds),
@@ -125,9 +109,9 @@ pub(super) fn factors<'a>(
 }
 
 /// How a cloud lies by its anchor.
-fn cloud_factor(id: SubmapId, covariance: &Covariance<6>) -> Factor {
+fn cloud_factor(id: SubmapId, covariance: &Covariance<6>) -> Factor<Node> {
     let t_i_j = Relative::Metric(PoseWithCovariance { pose: Se3::identity(), covariance: *covariance });
-    Factor { label: Label::Cloud, i: id, j: cloud_of(id), t_i_j, weight: 1.0 }
+    Factor { label: Label::Cloud, i: Node::Anchor(id), j: Node::Cloud(id), t_i_j, weight: 1.0 }
 }
 
 /// Of every submap with more than one alignment that may share something: the covariance of its cloud.
@@ -170,15 +154,15 @@ impl Shared {
     }
 
     /// The alignment's factor, between clouds where there are any.
-    fn factor(&self, factor: Factor, clouds: &BTreeMap<SubmapId, Covariance<6>>) -> Factor {
+    fn factor(&self, factor: Factor<Node>, clouds: &BTreeMap<SubmapId, Covariance<6>>) -> Factor<Node> {
         let (mut tied, mut left) = (factor, self.covariance);
-        if let Some(taken) = clouds.get(&factor.i).and_then(|cloud| self.at_i.meet(cloud)) {
+        if let Some(taken) = clouds.get(&factor.i.submap()).and_then(|cloud| self.at_i.meet(cloud)) {
             left -= self.t_j_i * taken * self.t_j_i.transpose();
-            tied.i = cloud_of(factor.i);
+            tied.i = Node::Cloud(factor.i.submap());
         }
-        if let Some(taken) = clouds.get(&factor.j).and_then(|cloud| self.at_j.meet(cloud)) {
+        if let Some(taken) = clouds.get(&factor.j.submap()).and_then(|cloud| self.at_j.meet(cloud)) {
             left -= taken;
-            tied.j = cloud_of(factor.j);
+            tied.j = Node::Cloud(factor.j.submap());
         }
         let (Relative::Metric(PoseWithCovariance { pose, .. }), Ok(covariance)) = (factor.t_i_j, Covariance::new(left))
         else {

@@ -95,7 +95,7 @@ fn pose(rng: &mut ChaCha8Rng, sigma: f64) -> Relative {
     Relative::Metric(PoseWithCovariance { pose, covariance: Covariance::new(covariance).unwrap() })
 }
 
-fn covariance(factor: &Factor) -> Matrix6<f64> {
+fn covariance(factor: &Factor<Node>) -> Matrix6<f64> {
     *factor.t_i_j.metric().unwrap().covariance.matrix()
 }
 
@@ -123,11 +123,11 @@ fn no_alignment_claims_more_than_it_did() {
             })
             .collect();
         let (graph, _) = factors(&all.iter().collect::<Vec<_>>(), |_| None);
-        let cloud = |id: SubmapId| covariance(graph.iter().find(|f| f.label == Label::Cloud && f.j == id).unwrap());
+        let cloud = |node: Node| covariance(graph.iter().find(|f| f.label == Label::Cloud && f.j == node).unwrap());
         assert_eq!(graph.iter().filter(|f| f.label == Label::Cloud).count(), 6);
         for (edge, factor) in all.iter().zip(&graph[6..]) {
-            assert!(is_cloud(factor.i) && is_cloud(factor.j) && factor.weight == 1.0);
-            assert_eq!((anchor_of(factor.i), anchor_of(factor.j)), (edge.measurement.i, edge.measurement.j));
+            let AgreedAlignment { i, j, .. } = edge.measurement;
+            assert!((factor.i, factor.j) == (Node::Cloud(i), Node::Cloud(j)) && factor.weight == 1.0);
             let Some(PoseWithCovariance { pose, covariance: claimed }) = edge.measurement.t_i_j.metric() else {
                 panic!()
             };

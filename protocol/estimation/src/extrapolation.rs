@@ -20,6 +20,7 @@
 //! by degrees of freedom.
 
 use super::drift_model::Stretch;
+use super::node::Node;
 use super::solve::Solution;
 use crate::geometry::{Covariance, PoseWithCovariance};
 use crate::ids::SubmapId;
@@ -38,12 +39,12 @@ pub struct End {
 impl End {
     /// Of an anchor that has a cloud in `solution`; `off_together` gives P.
     pub(super) fn of(
-        solution: &Solution,
+        solution: &Solution<Node>,
         anchor: SubmapId,
         stretch: Stretch,
-        off_together: impl FnOnce(&Solution) -> Option<Matrix6<f64>>,
+        off_together: impl FnOnce(&Solution<Node>) -> Option<Matrix6<f64>>,
     ) -> Option<Self> {
-        let (_, cloud) = solution.graph().cloud_of(solution.graph().position(anchor)?)?;
+        let (_, cloud) = solution.graph().cloud_of(solution.graph().position(Node::Anchor(anchor))?)?;
         let gain = off_together(solution)? * cloud.t_i_j().metric()?.covariance.information();
         Some(Self { gain, stretch })
     }

@@ -3,7 +3,7 @@
 use super::admission::{SIGMA_ROTATION_MAX, SIGMA_TRANSLATION_MAX};
 use super::joint::*;
 use super::position::{SeenPoint, StatedPoint};
-use super::solve::SolveError;
+use super::solve::{ComponentError, SolveError};
 use super::test_graphs::*;
 use super::test_world::*;
 use crate::config::EstimateConfig;
@@ -205,7 +205,7 @@ fn a_robot_that_is_tied_all_over_is_left_out_and_it_is_said_why() {
         let of_one = [edge.measurement.i.frame, edge.measurement.j.frame].contains(&frame(1));
         let why = match edge.unused {
             None => "used",
-            Some(Unused::Failed(SolveError::TooDense { .. })) => "too dense",
+            Some(Unused::Failed(ComponentError::Solve(SolveError::TooDense { .. }))) => "too dense",
             Some(Unused::RepeatsPair(_)) => "repeats",
             Some(_) => "otherwise",
         };
@@ -215,7 +215,7 @@ fn a_robot_that_is_tied_all_over_is_left_out_and_it_is_said_why() {
     let dense = map.edges().iter().filter_map(|e| e.unused).find(|why| matches!(why, Unused::Failed(_))).unwrap();
     assert!(dense.to_string().contains("too densely tied"), "{dense}");
     assert!(
-        matches!(dense, Unused::Failed(SolveError::TooDense { bytes, limit: MAP_BYTES_MAX }) if bytes > MAP_BYTES_MAX)
+        matches!(dense, Unused::Failed(ComponentError::Solve(SolveError::TooDense { bytes, limit: MAP_BYTES_MAX })) if bytes > MAP_BYTES_MAX)
     );
     assert_eq!(reasons.get(&(true, "used")), None);
     assert_eq!(reasons.get(&(false, "too dense")), None);

@@ -11,13 +11,14 @@
 use super::admission::{Admission, Kind};
 use super::distortion::{self, Charges};
 use super::drift_model::DriftModel;
-use super::graph::{Factor, Graph, Label};
+use super::graph::{Factor, Graph};
 use super::joint_covariance::{JointError, JointPoses};
+use super::node::{Label, Node};
 use super::optimality::Optimality;
 use super::pairs::{self, Pair};
 use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
-use super::solve::{Solution, SolveError, solve_within};
+use super::solve::{ComponentError, Solution, SolveError, solve_within};
 use crate::config::EstimateConfig;
 use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -139,7 +140,7 @@ pub enum Unused {
     TooFew,
     /// Its component could not be solved; its frame conditions it worst.
     #[error("the component could not be solved: {0}")]
-    Failed(SolveError),
+    Failed(ComponentError<Node>),
 }
 
 /// A measurement and what became of it.
@@ -191,7 +192,7 @@ pub struct PairEstimate {
 #[derive(Clone, Debug)]
 struct Component {
     frames: Vec<FrameId>,
-    solution: Result<Solution, SolveError>,
+    solution: Result<Solution<Node>, ComponentError<Node>>,
 }
 
 /// What a component's estimate falls short of.
@@ -199,7 +200,7 @@ struct Component {
 pub enum Shortfall {
     /// It has none.
     #[error("could not be solved, so that nothing is known but each frame's own odometry: {0}")]
-    Unsolved(SolveError),
+    Unsolved(ComponentError<Node>),
     /// It is not at the minimum.
     #[error(
         "no minimum after {iterations} iterations, so that poses and covariances are provisional; raise \
@@ -237,7 +238,7 @@ pub struct JointEstimate {
 pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate {
     let mut admission = Admission::new(problem);
     let mut pairs = pairs::consensus(&mut admission, config);
-    let start = pairs::start(&admission, &pairs);
+    let start = pairs::start(&admission, &pairs).into_iter().map(|(id, t)| (Node::Anchor(id), t)).collect();
     let mut map = Map::solve(&mut admission, &mut pairs, start, config);
     let unknown_scale = admission.unknown_scale.clone();
     let scales = pairs::sigma_scales(&pairs);
@@ -255,7 +256,7 @@ pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate
 struct Map {
     solutions: Vec<Solved>,
     /// Latest `t_world_anchor`, the start of the next solve.
-    start: BTreeMap<SubmapId, Sim3>,
+    start: BTreeMap<Node, Sim3>,
 }
 
 impl Map {
@@ -263,7 +264,7 @@ impl Map {
     fn solve(
         admission: &mut Admission,
         pairs: &mut [Pair],
-        mut start: BTreeMap<SubmapId, Sim3>,
+        mut start: BTreeMap<Node, Sim3>,
         config: &EstimateConfig,
     ) -> Self {
         let mut round = 0;
@@ -301,18 +302,19 @@ impl Map {
     }
 }
 
-type Solved = (BTreeSet<FrameId>, Result<Solution, SolveError>);
+type Solved = (BTreeSet<FrameId>, Result<Solution<Node>, ComponentError<Node>>);
 
 /// Builds and solves every component from the measurements that count at present.
-fn solve_components(admission: &Admission, start: &BTreeMap<SubmapId, Sim3>, iterations_max: usize) -> Vec<Solved> {
+fn solve_components(admission: &Admission, start: &BTreeMap<Node, Sim3>, iterations_max: usize) -> Vec<Solved> {
     let mut groups: BTreeMap<usize, BTreeSet<FrameId>> = BTreeMap::new();
     for (frame, group) in admission.groups() {
         groups.entry(group).or_default().insert(frame);
     }
     let used = || admission.edges.iter().filter(|e| e.is_used());
     let solve_group = |members: BTreeSet<FrameId>| {
-        let mut nodes: BTreeSet<SubmapId> = members.iter().flat_map(|f| admission.chains[f].ids(*f)).collect();
-        let mut factors: Vec<Factor> = members.iter().flat_map(|f| admission.chains[f].factors(*f)).collect();
+        let mut nodes: BTreeSet<Node> =
+            members.iter().flat_map(|f| admission.chains[f].ids(*f)).map(Node::Anchor).collect();
+        let mut factors: Vec<Factor<Node>> = members.iter().flat_map(|f| admission.chains[f].factors(*f)).collect();
         let tied: Vec<&EdgeEstimate> = used().filter(|e| members.contains(&e.measurement.i.frame)).collect();
         let (tied, gains) = distortion::factors(&tied, |id| admission.around(id));
         factors.extend(tied);
@@ -321,13 +323,14 @@ fn solve_components(admission: &Admission, start: &BTreeMap<SubmapId, Sim3>, ite
             Ok(mut graphs) if graphs.len() == 1 => {
                 let mut graph = graphs.remove(0);
                 graph.correlate(&gains);
-                let place = |id: &SubmapId| start.get(id).or_else(|| start.get(&distortion::anchor_of(*id))).copied();
-                let start = graph.nodes().iter().map(|id| place(id).unwrap_or_else(Sim3::identity));
+                // A cloud that is new lies where its anchor does.
+                let place = |node: &Node| start.get(node).or_else(|| start.get(&Node::Anchor(node.submap()))).copied();
+                let start = graph.nodes().iter().map(|node| place(node).unwrap_or_else(Sim3::identity));
                 let start = start.collect();
-                solve_within(graph, start, iterations_max, MAP_BYTES_MAX).map_err(|e| e.renamed(distortion::anchor_of))
+                solve_within(graph, start, iterations_max, MAP_BYTES_MAX)
             }
             // Admission admits only what a graph accepts, and a chain is connected.
-            _ => Err(SolveError::NotFinite),
+            _ => Err(SolveError::NotFinite.into()),
         };
         (members, solution)
     };
@@ -349,14 +352,14 @@ impl EdgeEstimate {
         }
     }
 
-    pub(super) fn factor(&self) -> Factor {
+    pub(super) fn factor(&self) -> Factor<Node> {
         let AgreedAlignment { entry, i, j, t_i_j } = self.measurement;
         let label = match self.kind {
             Kind::Alignment => Label::Alignment(entry),
             Kind::Sighting => Label::Sighting(entry),
             Kind::Position => Label::Position(entry),
         };
-        Factor { label, i, j, t_i_j, weight: self.weight }
+        Factor { label, i: i.into(), j: j.into(), t_i_j, weight: self.weight }
     }
 
     /// `t_i_j`, one of several between its two frames that are taken as independent.
@@ -434,7 +437,7 @@ impl JointEstimate {
     pub fn values(&self, component: usize) -> BTreeMap<SubmapId, Se3> {
         let solution = self.components.get(component).and_then(|c| c.solution.as_ref().ok());
         let places = solution.into_iter().flat_map(|s| s.graph().nodes().iter().copied().zip(s.values()));
-        places.filter(|(id, _)| !distortion::is_cloud(*id)).map(|(id, value)| (id, value.to_se3())).collect()
+        places.filter_map(|(node, value)| Some((node.anchor()?, value.to_se3()))).collect()
     }
 
     /// `t_i_j` between two anchors of one component, cross-correlations included: rigid between metric frames and
@@ -479,7 +482,7 @@ impl JointEstimate {
         &self.edges
     }
 
-    pub(super) fn solution_of(&self, a: FrameId, b: FrameId) -> Option<&Solution> {
+    pub(super) fn solution_of(&self, a: FrameId, b: FrameId) -> Option<&Solution<Node>> {
         let component = self.component_of(a).filter(|c| self.component_of(b) == Some(*c))?;
         self.components[component].solution.as_ref().ok()
     }

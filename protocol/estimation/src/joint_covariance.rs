@@ -7,11 +7,12 @@
 //! Perturbations are local (on the right): `T ⊕ δ = T Exp(δ)`, `δ = (ρ, φ)` of a rigid pose and `(ρ, φ, λ)` of a
 //! similarity, translation first, lengths in the units of the anchor's frame.
 
-use super::marginals::{certain, is_rigid, relation, spread};
+use super::graph::{Key, is_rigid};
+use super::marginals::{certain, relation, spread};
 use super::solve::Solution;
 use crate::geometry::sim3::Matrix7;
 use crate::geometry::{Relative, Sim3};
-use crate::ids::{FrameId, SubmapId};
+use crate::ids::SubmapId;
 use nalgebra::DMatrix;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -22,7 +23,7 @@ pub const JOINT_ANCHORS_MAX: usize = 128;
 
 /// Why there is no joint covariance.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
-pub enum JointError {
+pub enum JointError<K = SubmapId> {
     /// More anchors than a dense matrix should hold.
     #[error("{got} anchors, at most {JOINT_ANCHORS_MAX} have a joint covariance; ask for fewer, or for pairs")]
     TooMany {
@@ -31,32 +32,32 @@ pub enum JointError {
     },
     /// An anchor that is not known, or that nothing ties to the reference.
     #[error("anchor {0:?} is not connected to the reference; ask for anchors of one component")]
-    Apart(SubmapId),
+    Apart(K),
     /// An anchor named twice has a covariance with itself that nobody can invert.
     #[error("anchor {0:?} is named twice; leave one out")]
-    Twice(SubmapId),
+    Twice(K),
 }
 
 /// Anchors as one of them sees them, and their covariance, cross-correlations included.
 #[derive(Clone, Debug, PartialEq)]
-pub struct JointPoses {
-    reference: SubmapId,
-    anchors: Vec<SubmapId>,
+pub struct JointPoses<K: Key = SubmapId> {
+    reference: K,
+    anchors: Vec<K>,
     poses: Vec<Sim3>,
     rows: Vec<Range<usize>>,
     covariance: DMatrix<f64>,
     /// Frames whose unit is not the metre.
-    unknown_scale: BTreeSet<FrameId>,
+    unknown_scale: BTreeSet<K::Unit>,
 }
 
-impl JointPoses {
+impl<K: Key> JointPoses<K> {
     /// The anchor that the others are told from.
-    pub fn reference(&self) -> SubmapId {
+    pub fn reference(&self) -> K {
         self.reference
     }
 
     /// The anchors, in the order they were asked for.
-    pub fn anchors(&self) -> &[SubmapId] {
+    pub fn anchors(&self) -> &[K] {
         &self.anchors
     }
 
@@ -78,8 +79,8 @@ impl JointPoses {
     }
 
     /// `t_a_b` of two of the anchors or the reference, from the joint covariance alone.
-    pub fn relative(&self, a: SubmapId, b: SubmapId) -> Option<Relative> {
-        let place = |id: SubmapId| self.anchors.iter().position(|&one| one == id);
+    pub fn relative(&self, a: K, b: K) -> Option<Relative> {
+        let place = |id: K| self.anchors.iter().position(|&one| one == id);
         let (at_a, at_b) = (place(a), place(b));
         if [(a, at_a), (b, at_b)].iter().any(|&(id, at)| at.is_none() && id != self.reference) {
             return None;
@@ -93,7 +94,7 @@ impl JointPoses {
         let cross = self.block(at_b, at_a) * adjoint.transpose();
         let covariance =
             self.block(at_b, at_b) - cross - cross.transpose() + adjoint * self.block(at_a, at_a) * adjoint.transpose();
-        relation(t_a_b, covariance, is_rigid(a.frame, b.frame, &self.unknown_scale))
+        relation(t_a_b, covariance, is_rigid(a.unit(), b.unit(), &self.unknown_scale))
     }
 
     /// Zero in what is certain.
@@ -108,18 +109,18 @@ impl JointPoses {
     }
 }
 
-impl Solution {
+impl<K: Key> Solution<K> {
     /// `t_reference_anchor` of several anchors of the component with their joint covariance. Frames in `unknown_scale`
     /// as in [`Solution::relative`].
     ///
     /// # Errors
     /// [`JointError`].
-    pub fn joint(
+    pub fn joint<N: Key<Unit = K::Unit> + Into<K>>(
         &self,
-        reference: SubmapId,
-        anchors: &[SubmapId],
-        unknown_scale: &BTreeSet<FrameId>,
-    ) -> Result<JointPoses, JointError> {
+        reference: N,
+        anchors: &[N],
+        unknown_scale: &BTreeSet<K::Unit>,
+    ) -> Result<JointPoses<N>, JointError<N>> {
         if anchors.len() > JOINT_ANCHORS_MAX {
             return Err(JointError::TooMany { got: anchors.len() });
         }
@@ -128,12 +129,12 @@ impl Solution {
             return Err(JointError::Twice(twice));
         }
         let mut halves = Halves::of(self);
-        let apart = |id: SubmapId| JointError::Apart(id);
-        let r = self.graph.position(reference).ok_or_else(|| apart(reference))?;
+        let place = |id: N| self.graph.position(id.into()).ok_or(JointError::Apart(id));
+        let r = place(reference)?;
         let (mut poses, mut rows, mut differences, mut end) = (Vec::new(), Vec::new(), Vec::new(), 0);
         for &id in anchors {
-            let k = self.graph.position(id).ok_or_else(|| apart(id))?;
-            let is_rigid = is_rigid(reference.frame, id.frame, unknown_scale);
+            let k = place(id)?;
+            let is_rigid = is_rigid(reference.unit(), id.unit(), unknown_scale);
             let t_reference_anchor = if k == r { Sim3::identity() } else { self.values[r].inverse() * self.values[k] };
             poses.push(if is_rigid { Sim3::from_se3(&t_reference_anchor.to_se3()) } else { t_reference_anchor });
             differences.push(halves.difference(r, k));
@@ -156,28 +157,28 @@ impl Solution {
     }
 
     /// [`Solution::relative`] of many pairs that share few anchors, at one solve for each anchor.
-    pub fn relatives(
+    pub fn relatives<N: Key<Unit = K::Unit> + Into<K>>(
         &self,
-        pairs: impl IntoIterator<Item = (SubmapId, SubmapId)>,
-        unknown_scale: &BTreeSet<FrameId>,
+        pairs: impl IntoIterator<Item = (N, N)>,
+        unknown_scale: &BTreeSet<K::Unit>,
     ) -> Vec<Option<Relative>> {
         let mut halves = Halves::of(self);
-        let mut one = |(i, j): (SubmapId, SubmapId)| {
-            let (a, b) = (self.graph.position(i)?, self.graph.position(j)?);
+        let mut one = |(i, j): (N, N)| {
+            let (a, b) = (self.graph.position(i.into())?, self.graph.position(j.into())?);
             if a == b {
                 return Some(Relative::Metric(certain()));
             }
             let difference = halves.difference(a, b);
             let t_i_j = self.values[a].inverse() * self.values[b];
-            relation(t_i_j, difference.times(&difference), is_rigid(i.frame, j.frame, unknown_scale))
+            relation(t_i_j, difference.times(&difference), is_rigid(i.unit(), j.unit(), unknown_scale))
         };
         pairs.into_iter().map(&mut one).collect()
     }
 }
 
 /// `L⁻¹ E` of the anchors met so far.
-struct Halves<'a> {
-    solution: &'a Solution,
+struct Halves<'a, K: Key> {
+    solution: &'a Solution<K>,
     of: BTreeMap<usize, Half>,
 }
 
@@ -188,8 +189,8 @@ struct Half {
     values: Vec<f64>,
 }
 
-impl<'a> Halves<'a> {
-    fn of(solution: &'a Solution) -> Self {
+impl<'a, K: Key> Halves<'a, K> {
+    fn of(solution: &'a Solution<K>) -> Self {
         Self { solution, of: BTreeMap::new() }
     }
 

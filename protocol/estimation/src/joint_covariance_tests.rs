@@ -1,15 +1,16 @@
 //! Joint covariances against dense algebra and against the truth.
 
-use super::super::graph::{Factor, Graph, Label};
+use super::super::graph::{Factor, Graph, Source};
 use super::super::solve::solve;
 use super::super::test_graphs::*;
 use super::super::test_world::World;
 use super::*;
 use crate::geometry::Covariance;
+use crate::ids::FrameId;
 use crate::kinds::ScaleKind;
 
 /// The world's measurements, all taken, as one component.
-fn solved(world: &World) -> (Solution, BTreeSet<FrameId>) {
+fn solved(world: &World) -> (Solution<SubmapId>, BTreeSet<FrameId>) {
     let unknown = world.problem.frames.iter().filter(|(_, chain)| chain.scale == ScaleKind::Unknown);
     let unknown: BTreeSet<FrameId> = unknown.map(|(frame, _)| *frame).collect();
     let mut factors = Vec::new();
@@ -17,11 +18,11 @@ fn solved(world: &World) -> (Solution, BTreeSet<FrameId>) {
         let id = |index: usize| SubmapId { frame, index: index as u32 };
         let step = |k: usize| (id(k - 1), id(k), Relative::Metric(chain.odometry[k]));
         let steps = (1..chain.odometry.len()).map(step);
-        factors.extend(steps.map(|(i, j, t_i_j)| Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 }));
+        factors.extend(steps.map(|(i, j, t_i_j)| Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 }));
     }
     let stated = world.problem.alignments.iter();
-    factors.extend(stated.map(|m| Factor {
-        label: Label::Alignment(m.entry),
+    factors.extend(stated.enumerate().map(|(k, m)| Factor {
+        label: Source::Measurement(k),
         i: m.i,
         j: m.j,
         t_i_j: m.t_i_j,
@@ -41,7 +42,7 @@ fn world(seed: u64, scales: &[Option<f64>], anchors: usize) -> World {
 }
 
 /// The row block of `δ_node` over all scalars.
-fn row_block(solution: &Solution, node: usize) -> DMatrix<f64> {
+fn row_block(solution: &Solution<SubmapId>, node: usize) -> DMatrix<f64> {
     let mut out = DMatrix::zeros(7, solution.pattern.scalars());
     for (scalar, column) in solution.row_block(node, &Matrix7::identity()) {
         out.column_mut(scalar).copy_from(&column);
@@ -49,7 +50,7 @@ fn row_block(solution: &Solution, node: usize) -> DMatrix<f64> {
     out
 }
 
-fn dense_inverse(solution: &Solution) -> DMatrix<f64> {
+fn dense_inverse(solution: &Solution<SubmapId>) -> DMatrix<f64> {
     let n = solution.pattern.scalars();
     let mut h = DMatrix::zeros(n, n);
     for edge in solution.graph.edges() {

@@ -1,7 +1,7 @@
 //! The whole map: truth, calibration, order, false alignments, and hostile sets of facts.
 
 use super::joint::*;
-use super::solve::SolveError;
+use super::solve::ComponentError;
 use super::test_graphs::*;
 use super::test_world::*;
 use crate::config::EstimateConfig;
@@ -387,7 +387,8 @@ fn a_submap_that_is_not_determined_is_named() {
         steps[6..].iter_mut().for_each(|step| step.covariance = sigmas(1e-9, 1e-9));
         let map = world.solve();
         for (frames, why) in map.shortfalls() {
-            let Shortfall::Unsolved(SolveError::UnderconstrainedAnchor(id)) = why else { panic!("{why}") };
+            let Shortfall::Unsolved(ComponentError::UnderconstrainedNode(node)) = why else { panic!("{why}") };
+            let id = node.submap();
             assert!(frames == [frame(1)] && id.frame == frame(1) && (5..10).contains(&id.index), "{id}");
             assert!(why.to_string().contains(&format!("submap {id} is not determined")), "{why}");
             told += 1;

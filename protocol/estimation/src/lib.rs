@@ -24,6 +24,7 @@
 mod admission;
 pub mod certificate;
 pub mod chordal;
+mod cloud_covariance;
 pub mod distortion;
 mod drift_model;
 pub mod extrapolation;
@@ -35,6 +36,7 @@ pub mod joint_covariance;
 mod loops;
 pub mod marginals;
 mod minimise;
+pub mod node;
 mod odometry_correlation;
 pub mod optimality;
 mod pairs;

@@ -5,12 +5,11 @@
 //! anchors relative to one take seven solves and one selected inversion (MATH §3: joint covariances, never sums of
 //! marginals).
 
-use super::graph::Edge;
+use super::graph::{Key, is_rigid};
 use super::solve::{Solution, Variables};
 use super::sparse::SelectedInverse;
 use crate::geometry::sim3::{Matrix7, Vector7};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
-use crate::ids::{FrameId, SubmapId};
 use nalgebra::Matrix6;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -18,29 +17,31 @@ use std::ops::Range;
 /// Standard deviation stated for relations that are certain by definition (an anchor in itself).
 const SIGMA_CERTAIN: f64 = 1e-9;
 
-impl Solution {
-    /// `t_i_j` between two anchors of the component with the covariance of its local perturbation: rigid, in the
-    /// frames' own unit, within one frame or between metric frames (those not in `unknown_scale`); a similarity
-    /// otherwise. `None` for anchors of other components.
-    pub fn relative(&self, i: SubmapId, j: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Option<Relative> {
+impl<K: Key> Solution<K> {
+    /// `t_i_j` between two nodes of the component with the covariance of its local perturbation: rigid, in their own
+    /// unit, within one unit or between metric ones (those not in `unknown_scale`); a similarity otherwise. `None` for
+    /// nodes of other components.
+    pub fn relative(&self, i: impl Into<K>, j: impl Into<K>, unknown_scale: &BTreeSet<K::Unit>) -> Option<Relative> {
+        let (i, j): (K, K) = (i.into(), j.into());
         let (a, b) = (self.graph.position(i)?, self.graph.position(j)?);
         let t_i_j = self.values[a].inverse() * self.values[b];
-        let rigid = is_rigid(i.frame, j.frame, unknown_scale);
+        let rigid = is_rigid(i.unit(), j.unit(), unknown_scale);
         if a == b {
             return Some(Relative::Metric(certain()));
         }
         relation(t_i_j, self.covariance_between(a, b)?, rigid)
     }
 
-    /// [`Solution::relative`] of every anchor to `reference`, in the order of the component's anchors.
-    pub fn relatives_to(&self, reference: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Vec<(SubmapId, Relative)> {
+    /// [`Solution::relative`] of every node to `reference`, in the order of the component's nodes.
+    pub fn relatives_to(&self, reference: impl Into<K>, unknown_scale: &BTreeSet<K::Unit>) -> Vec<(K, Relative)> {
+        let reference: K = reference.into();
         let Some(r) = self.graph.position(reference) else { return Vec::new() };
         let Some(columns) = self.columns_of(&self.row_block(r, &Matrix7::identity())) else { return Vec::new() };
         let with_scale = |k: usize| Some((self.variables(k)[0]?.0, self.variables(k)[6]?.0));
         let inverse = self.pattern.selected_inverse(&self.factor, (0..self.values.len()).filter_map(with_scale));
         let at_reference = self.rows(&columns, r);
         let anchors = self.graph.nodes().iter().enumerate();
-        let one = |(k, &id): (usize, &SubmapId)| {
+        let one = |(k, &id): (usize, &K)| {
             if k == r {
                 return Some((id, Relative::Metric(certain())));
             }
@@ -57,7 +58,7 @@ impl Solution {
             let a = t_r_k.inverse().adjoint();
             let cross = self.rows(&columns, k) * a.transpose();
             let joint = own - cross - cross.transpose() + a * at_reference * a.transpose();
-            let rigid = is_rigid(reference.frame, id.frame, unknown_scale);
+            let rigid = is_rigid(reference.unit(), id.unit(), unknown_scale);
             let direct = || self.relative(reference, id, unknown_scale);
             Some((id, relation(t_r_k, joint, rigid).or_else(direct)?))
         };
@@ -71,44 +72,13 @@ impl Solution {
         Some(Matrix7::from_fn(|r, c| lower[(r.max(c), r.min(c))]))
     }
 
-    /// Covariance of δ in `X_x⁻¹ X_a ⊕ δ` with what the factor of a's cloud is off by, between anchors of one unit.
-    pub(super) fn covariance_with_cloud(&self, x: SubmapId, a: SubmapId) -> Option<Matrix6<f64>> {
-        let [x, a] = [x, a].map(|id| self.graph.position(id));
-        let (to, cloud) = (self.half_solved(x?, a?), self.half_solve(&self.cloud_rows(a?)?));
-        Some(Matrix6::from_fn(|r, c| to.dot(r, &cloud, c)))
-    }
-
-    /// What [`Solution::covariance_with_cloud`] is from every anchor, at one solve.
-    pub(super) fn with_cloud(&self, a: SubmapId) -> Option<WithCloud<'_>> {
-        let a = self.graph.position(a)?;
-        Some(WithCloud { solution: self, a, columns: self.columns_of(&self.cloud_rows(a)?)? })
-    }
-
-    /// The row block of what the factor of an anchor's cloud is off by: that of the cloud, and of the steps that it
-    /// follows.
-    fn cloud_rows(&self, anchor: usize) -> Option<Vec<(usize, Vector7)>> {
-        let (place, cloud) = self.graph.cloud_of(anchor)?;
-        let of = |edge: &Edge| {
-            self.difference(edge.i, edge.j, &(self.values[edge.j].inverse() * self.values[edge.i]).adjoint())
-        };
-        let mut rows = of(cloud);
-        for (step, gain) in self.graph.correlations.get(&place).into_iter().flat_map(|correlation| &correlation.steps) {
-            let mut follows = Matrix7::zeros();
-            follows.fixed_view_mut::<6, 6>(0, 0).copy_from(&-gain);
-            let followed =
-                of(&self.graph.edges()[*step]).into_iter().map(|(scalar, column)| (scalar, follows * column));
-            merge(&mut rows, followed);
-        }
-        Some(rows)
-    }
-
     /// `L⁻¹ Aᵀ` for the row block A of `X_a⁻¹ X_b`.
-    fn half_solved(&self, a: usize, b: usize) -> HalfSolved {
+    pub(super) fn half_solved(&self, a: usize, b: usize) -> HalfSolved {
         let t_b_a = self.values[b].inverse() * self.values[a];
         self.half_solve(&self.difference(a, b, &t_b_a.adjoint()))
     }
 
-    fn half_solve(&self, rows: &[(usize, Vector7)]) -> HalfSolved {
+    pub(super) fn half_solve(&self, rows: &[(usize, Vector7)]) -> HalfSolved {
         let mut columns = spread(rows, self.pattern.scalars());
         let touched = self.pattern.solve_upwards(&self.factor, rows.iter().map(|(scalar, _)| *scalar), &mut columns);
         HalfSolved { columns, touched, n: self.pattern.scalars() }
@@ -143,7 +113,7 @@ impl Solution {
     }
 
     /// The row block A of `δ_b − Ad δ_a` as (scalar, column of A).
-    fn difference(&self, a: usize, b: usize, adjoint: &Matrix7) -> Vec<(usize, Vector7)> {
+    pub(super) fn difference(&self, a: usize, b: usize, adjoint: &Matrix7) -> Vec<(usize, Vector7)> {
         let mut rows = self.row_block(b, &Matrix7::identity());
         merge(&mut rows, self.row_block(a, &-adjoint));
         rows
@@ -158,14 +128,14 @@ impl Solution {
     }
 
     /// `H⁻¹ Aᵀ`, seven columns.
-    fn columns_of(&self, rows: &[(usize, Vector7)]) -> Option<Vec<f64>> {
+    pub(super) fn columns_of(&self, rows: &[(usize, Vector7)]) -> Option<Vec<f64>> {
         let mut columns = spread(rows, self.pattern.scalars());
         self.pattern.solve(&self.factor, &mut columns);
         Some(columns)
     }
 
     /// Rows of `columns` that belong to one anchor.
-    fn rows(&self, columns: &[f64], node: usize) -> Matrix7 {
+    pub(super) fn rows(&self, columns: &[f64], node: usize) -> Matrix7 {
         let mut out = Matrix7::zeros();
         for (r, variable) in self.variables(node).iter().enumerate() {
             if let Some((variable, offset)) = variable {
@@ -191,27 +161,8 @@ impl Solution {
     }
 }
 
-/// How what an anchor's cloud is off by goes with all anchors.
-pub(super) struct WithCloud<'a> {
-    solution: &'a Solution,
-    a: usize,
-    /// Seven.
-    columns: Vec<f64>,
-}
-
-impl WithCloud<'_> {
-    /// As [`Solution::covariance_with_cloud`].
-    pub(super) fn seen_from(&self, x: SubmapId) -> Option<Matrix6<f64>> {
-        let Solution { graph, values, .. } = self.solution;
-        let x = graph.position(x)?;
-        let adjoint = (values[self.a].inverse() * values[x]).adjoint();
-        let rows = |node| self.solution.rows(&self.columns, node);
-        Some((rows(self.a) - adjoint * rows(x)).fixed_view::<6, 6>(0, 0).into_owned())
-    }
-}
-
 /// `L⁻¹ Aᵀ`: seven columns of `n` scalars, of which all but some ranges are zero.
-struct HalfSolved {
+pub(super) struct HalfSolved {
     columns: Vec<f64>,
     touched: Vec<Range<usize>>,
     n: usize,
@@ -219,7 +170,7 @@ struct HalfSolved {
 
 impl HalfSolved {
     /// The inner product of one column and another's.
-    fn dot(&self, column: usize, other: &Self, of_other: usize) -> f64 {
+    pub(super) fn dot(&self, column: usize, other: &Self, of_other: usize) -> f64 {
         let of = |half: &'_ Self, k: usize| k * half.n..(k + 1) * half.n;
         let (x, y) = (&self.columns[of(self, column)], &other.columns[of(other, of_other)]);
         let over =
@@ -228,7 +179,8 @@ impl HalfSolved {
     }
 }
 
-fn merge(rows: &mut Vec<(usize, Vector7)>, more: impl IntoIterator<Item = (usize, Vector7)>) {
+/// Adds rows of A to those that are there.
+pub(super) fn merge(rows: &mut Vec<(usize, Vector7)>, more: impl IntoIterator<Item = (usize, Vector7)>) {
     for (scalar, column) in more {
         match rows.iter_mut().find(|(known, _)| *known == scalar) {
             Some((_, sum)) => *sum += column,
@@ -252,11 +204,6 @@ pub(super) fn spread(rows: &[(usize, Vector7)], n: usize) -> Vec<f64> {
 pub(super) fn certain() -> PoseWithCovariance {
     let covariance = Covariance::new_or_wider(Matrix6::identity() * (SIGMA_CERTAIN * SIGMA_CERTAIN));
     PoseWithCovariance { pose: Se3::identity(), covariance }
-}
-
-/// Whether a relation between two frames is rigid.
-pub(super) fn is_rigid(a: FrameId, b: FrameId, unknown_scale: &BTreeSet<FrameId>) -> bool {
-    a == b || !(unknown_scale.contains(&a) || unknown_scale.contains(&b))
 }
 
 pub(super) fn relation(sim: Sim3, covariance: Matrix7, rigid: bool) -> Option<Relative> {

@@ -1,5 +1,5 @@
 use super::*;
-use crate::geometry::{Relative, Se3};
+use crate::geometry::{Relative, Se3, Sim3};
 use crate::graph::Factor;
 use crate::solve::solve;
 use crate::test_graphs::{any_pose, any_step, frame, measured, rng, sigmas, submap};
@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeSet;
 
 /// The anchor that has a cloud.
-const MIDDLE: u32 = 1;
+const MIDDLE: usize = 1;
 
 fn walk() -> DriftModel {
     DriftModel { whole: sigmas(0.1, 0.03), keyframes: NonZero::new(4) }
@@ -21,20 +21,21 @@ fn any_measured(rng: &mut ChaCha8Rng) -> PoseWithCovariance {
 }
 
 /// Three anchors, the cloud of the middle one, and a measurement that ties the cloud to the first.
-fn chain(rng: &mut ChaCha8Rng) -> (Graph, Vec<Sim3>) {
-    let cloud = SubmapId { index: 1 << 31 | MIDDLE, ..submap(0, 0) };
+fn chain(rng: &mut ChaCha8Rng) -> (Graph<Node>, Vec<Sim3>) {
+    let anchor = |index| Node::Anchor(submap(0, index));
+    let cloud = Node::Cloud(submap(0, MIDDLE));
     let steps: [PoseWithCovariance; 2] = core::array::from_fn(|_| any_measured(rng));
     let (left, gains) = conditional_covariance(&sigmas(0.02, 0.01), &walk(), [Some(&steps[0]), Some(&steps[1])]);
     let factor = |label, i, j, t: PoseWithCovariance| Factor { label, i, j, t_i_j: Relative::Metric(t), weight: 1.0 };
     let at = PoseWithCovariance { pose: Se3::identity(), covariance: left };
     let seen = measured(rng, &steps[0].pose, sigmas(0.05, 0.02));
     let factors = vec![
-        factor(Label::Odometry, submap(0, 0), submap(0, 1), steps[0]),
-        factor(Label::Odometry, submap(0, 1), submap(0, 2), steps[1]),
-        factor(Label::Cloud, submap(0, 1), cloud, at),
-        factor(Label::Alignment(crate::ids::EntryId { frame: frame(0), seq: 0 }), submap(0, 0), cloud, seen),
+        factor(Label::Odometry, anchor(0), anchor(1), steps[0]),
+        factor(Label::Odometry, anchor(1), anchor(2), steps[1]),
+        factor(Label::Cloud, anchor(MIDDLE), cloud, at),
+        factor(Label::Alignment(crate::ids::EntryId { frame: frame(0), seq: 0 }), anchor(0), cloud, seen),
     ];
-    let nodes = BTreeSet::from([submap(0, 0), submap(0, 1), submap(0, 2), cloud]);
+    let nodes = BTreeSet::from([anchor(0), anchor(1), anchor(2), cloud]);
     let mut graph = Graph::components(&nodes, &BTreeSet::new(), factors).unwrap().remove(0);
     graph.correlate(&BTreeMap::from([(submap(0, 1), gains)]));
     let first = any_pose(rng, 5.0);
@@ -44,8 +45,8 @@ fn chain(rng: &mut ChaCha8Rng) -> (Graph, Vec<Sim3>) {
     (graph, values.to_vec())
 }
 
-fn cloud_of(graph: &Graph) -> (&Edge, &OdometryCorrelation) {
-    let (place, edge) = graph.cloud_of(MIDDLE as usize).unwrap();
+fn cloud_of(graph: &Graph<Node>) -> (&Edge<Node>, &Correlation) {
+    let (place, edge) = graph.cloud_of(MIDDLE).unwrap();
     (edge, &graph.correlations[&place])
 }
 
@@ -92,7 +93,7 @@ fn the_solver_takes_the_factor_for_what_it_is() {
     assert!((0..18).all(|k| gradient_of(k).abs() < 1e-4), "not at the minimum");
     // Whitened residuals, cloud and all.
     let rows = |values: &[Sim3]| -> Vec<f64> {
-        let one = |(k, edge): (usize, &Edge)| {
+        let one = |(k, edge): (usize, &Edge<Node>)| {
             let plain = edge.residual(values).fixed_rows::<6>(0).into_owned();
             let r = graph.correlations.get(&k).map_or(plain, |correlation| correlation.residual(graph, edge, values));
             let whitened: Vector6<f64> = edge.information_rigid().cholesky().unwrap().l().transpose() * r;

@@ -2,7 +2,7 @@
 //! weights, by the dual certificate ([`super::certificate`]) of the minimum of SE-Sync's cost next to the estimate.
 
 use super::chordal::{ChordalEdge, ChordalGraph};
-use super::graph::Factor;
+use super::graph::{Factor, Key};
 use super::solve::Solution;
 use crate::geometry::{Covariance, Relative, Sim3};
 pub use crate::kinds::Optimality;
@@ -15,7 +15,7 @@ const ISOTROPIC: f64 = 1e-6;
 /// weights of its measurements suggest: the two costs have their minima close together, but not in one place.
 const NEAR_SIGMAS: f64 = 3.0;
 
-impl Solution {
+impl<K: Key> Solution<K> {
     /// Tries to prove that this is the global optimum.
     pub fn optimality(&self) -> Optimality {
         if self.values.len() < 2 {
@@ -35,7 +35,7 @@ impl Solution {
     }
 
     /// SE-Sync's form of a factor, if its weight is isotropic.
-    fn isotropic(&self, factor: &Factor) -> Option<ChordalEdge> {
+    fn isotropic(&self, factor: &Factor<K>) -> Option<ChordalEdge> {
         let Relative::Metric(t_i_j) = factor.t_i_j else { return None };
         let [translation, rotation] = isotropic_variances(&t_i_j.covariance)?;
         Some(ChordalEdge {
@@ -108,13 +108,13 @@ mod tests {
         let id = |index| SubmapId { frame, index };
         let turn = |k: f64| crate::geometry::So3::exp(&nalgebra::Vector3::new(0.0, 0.0, k));
         let factor = |i: u32, j: u32| Factor {
-            label: crate::graph::Label::Odometry,
+            label: crate::graph::Source::Odometry,
             i: id(i),
             j: id(j),
             t_i_j: Relative::Metric(PoseWithCovariance { pose: Se3::identity(), covariance }),
             weight: 1.0,
         };
-        let factors: Vec<Factor> = (0..nodes).map(|k| factor(k, (k + 1) % nodes)).collect();
+        let factors: Vec<Factor<SubmapId>> = (0..nodes).map(|k| factor(k, (k + 1) % nodes)).collect();
         let ids = (0..nodes).map(id).collect();
         let solve_from = |winding: f64| {
             let graphs = crate::graph::Graph::components(&ids, &Default::default(), factors.clone());

@@ -7,9 +7,9 @@
 
 use super::admission::{Admission, Chain};
 use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
+use super::graph::is_rigid;
 use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
 use super::loops::{self, Loops};
-use super::marginals::is_rigid;
 use crate::config::EstimateConfig;
 use crate::geometry::{Disagreement, Relative, Sim3, chi2};
 use crate::ids::{FrameId, SubmapId};

@@ -1,11 +1,11 @@
 //! Where anchors and origins lie in a frame's own coordinates. A frame's origin hangs on its first anchor alone, and
 //! bodies on their last; what their errors have to do with the map's is told by [`ends`](super::extrapolation).
 
-use super::distortion;
 use super::drift_model::DriftModel;
 use super::extrapolation::End;
 use super::joint::JointEstimate;
 use super::marginals::certain;
+use super::node::Node;
 use super::solve::Solution;
 use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{FrameId, SubmapId};
@@ -20,7 +20,7 @@ impl JointEstimate {
         if submap == first {
             return Some(Relative::Metric(*origin));
         }
-        let off_together = |solution: &Solution| solution.covariance_with_cloud(submap, first);
+        let off_together = |solution: &Solution<Node>| solution.covariance_with_cloud(submap, first);
         Some(from_origin(origin, self.start(reference, off_together), &self.relative(first, submap)?))
     }
 
@@ -32,12 +32,12 @@ impl JointEstimate {
             return Vec::new();
         };
         let with_cloud = solution.with_cloud(first);
-        let place = |(id, t): (SubmapId, Relative)| {
+        let place = |(node, t): (Node, Relative)| {
+            let id = node.anchor()?;
             let start = || self.start(reference, |_| with_cloud.as_ref()?.seen_from(id));
-            (id, if id == first { Relative::Metric(*origin) } else { from_origin(origin, start(), &t) })
+            Some((id, if id == first { Relative::Metric(*origin) } else { from_origin(origin, start(), &t) }))
         };
-        let all = solution.relatives_to(first, &self.unknown_scale).into_iter();
-        all.filter(|(id, _)| !distortion::is_cloud(*id)).map(place).collect()
+        solution.relatives_to(first, &self.unknown_scale).into_iter().filter_map(place).collect()
     }
 
     /// `t_a_b` between the frames' origins.
@@ -46,7 +46,7 @@ impl JointEstimate {
             return self.component_of(a).map(|_| Relative::Metric(certain()));
         }
         let t_b_anchor0 = self.origins.get(&b)?;
-        let seen_from_a = |solution: &Solution| solution.covariance_with_cloud(first_of(a), first_of(b));
+        let seen_from_a = |solution: &Solution<Node>| solution.covariance_with_cloud(first_of(a), first_of(b));
         Some(match (self.anchor(a, first_of(b))?, self.start(b, seen_from_a)) {
             (Relative::Metric(t_a_anchor0), Some(end)) => {
                 Relative::Metric(end.onward(&t_a_anchor0, &t_b_anchor0.inverse()))
@@ -62,7 +62,7 @@ impl JointEstimate {
         let Some(solution) = solution else { return BTreeMap::new() };
         let together = self.ends.iter().filter(|(frame, _)| self.component_of(**frame) == self.component_of(reference));
         let end = |(_, [_, (last, walk)]): (_, &[(SubmapId, DriftModel); 2])| {
-            let seen_from = |solution: &Solution| solution.covariance_with_cloud(first_of(reference), *last);
+            let seen_from = |solution: &Solution<Node>| solution.covariance_with_cloud(first_of(reference), *last);
             Some((*last, End::of(solution, *last, walk.after_anchor()?, seen_from)?))
         };
         together.filter_map(end).collect()
@@ -70,7 +70,7 @@ impl JointEstimate {
 
     /// How a frame's origin lies by its first anchor, as seen from where `off_together` says: by the covariance of how
     /// that anchor lies from there with what its cloud is off by.
-    fn start(&self, frame: FrameId, off_together: impl FnOnce(&Solution) -> Option<Matrix6<f64>>) -> Option<End> {
+    fn start(&self, frame: FrameId, off_together: impl FnOnce(&Solution<Node>) -> Option<Matrix6<f64>>) -> Option<End> {
         let [(first, walk), _] = self.ends.get(&frame)?;
         End::of(self.solution_of(frame, frame)?, *first, walk.before_anchor()?, off_together)
     }

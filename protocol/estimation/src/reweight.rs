@@ -5,7 +5,8 @@
 //! without that measurement (deletion residuals of least squares), and needs no second solve. Directions in which the
 //! measurement is the map's only source have no redundancy and are not tested.
 
-use super::graph::{Edge, Label};
+use super::graph::{Edge, Key};
+use super::node::{Label, Node};
 use super::solve::Solution;
 use super::sparse::SelectedInverse;
 use crate::geometry::chi2;
@@ -30,7 +31,7 @@ pub(super) struct Drop {
 
 /// The measurements to leave out before solving again: the worst one (first in canonical order among equals), or all
 /// that fail once `round` has reached the limit.
-pub(super) fn contradictions(solution: &Solution, round: usize) -> Vec<Drop> {
+pub(super) fn contradictions(solution: &Solution<Node>, round: usize) -> Vec<Drop> {
     let inverse = solution.selected_inverse();
     let tested = solution.graph().edges().iter().filter(|e| e.label.is_doubted());
     let failing = tested.filter_map(|edge| {
@@ -59,7 +60,11 @@ pub(super) struct LeftOut {
 }
 
 /// The leave-one-out χ² of a measurement.
-pub(super) fn leave_one_out(solution: &Solution, inverse: &SelectedInverse<'_>, edge: &Edge) -> Option<LeftOut> {
+pub(super) fn leave_one_out<K: Key>(
+    solution: &Solution<K>,
+    inverse: &SelectedInverse<'_>,
+    edge: &Edge<K>,
+) -> Option<LeftOut> {
     let residual = edge.residual(solution.values());
     let predicted = solution.covariance_along(inverse, edge.i, edge.j)?;
     match &edge.t_i_j() {

@@ -3,21 +3,20 @@
 //! The result depends on the graph and the start alone; the start is made from the same set of facts, never from an
 //! earlier estimate.
 
-use super::graph::{Edge, Graph};
+use super::graph::{CorrelatedResidual, Edge, Graph, Key};
 use super::minimise::{Minimum, Normal, Objective, minimise};
-use super::odometry_correlation::CorrelatedResidual;
 use super::sparse::{BlockPattern, Factor, Slot};
 use crate::geometry::{Se3, Sim3, se3};
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector6};
 use std::sync::Arc;
 
-pub use super::solve_error::SolveError;
+pub use super::solve_error::{ComponentError, SolveError};
 pub use super::sparse::FACTOR_BYTES_MAX;
 
 /// A solved component: estimates, and the factorisation from which covariances are drawn.
 #[derive(Clone, Debug)]
-pub struct Solution {
-    pub(super) graph: Graph,
+pub struct Solution<K: Key> {
+    pub(super) graph: Graph<K>,
     pub(super) values: Vec<Sim3>,
     /// Weighted sum of squared residuals at the end.
     pub chi2: f64,
@@ -31,9 +30,9 @@ pub struct Solution {
     pub(super) factor: Factor,
 }
 
-impl Solution {
+impl<K: Key> Solution<K> {
     /// The component.
-    pub fn graph(&self) -> &Graph {
+    pub fn graph(&self) -> &Graph<K> {
         &self.graph
     }
 
@@ -60,15 +59,19 @@ pub struct ChiSquaredMinimum {
 ///
 /// # Errors
 /// As [`solve`], but a direction that no measurement determines may pass unseen.
-pub fn minimum(graph: &Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<ChiSquaredMinimum, SolveError> {
+pub fn minimum<K: Key>(
+    graph: &Graph<K>,
+    start: Vec<Sim3>,
+    iterations_max: usize,
+) -> Result<ChiSquaredMinimum, ComponentError<K>> {
     expect_start(graph, &start)?;
     let system = System::new(graph, FACTOR_BYTES_MAX)?;
-    let found = minimise(&system, start, iterations_max).map_err(|error| error.of(graph))?;
+    let found = minimise(&system, start, iterations_max).map_err(|error| ComponentError::of(error, graph))?;
     let (chi2, iterations, converged) = (found.cost, found.iterations, found.converged);
     Ok(ChiSquaredMinimum { values: found.values, chi2, iterations, converged })
 }
 
-fn expect_start(graph: &Graph, start: &[Sim3]) -> Result<(), SolveError> {
+fn expect_start<K: Key>(graph: &Graph<K>, start: &[Sim3]) -> Result<(), SolveError> {
     let (want, got) = (graph.nodes().len(), start.len());
     if want == got { Ok(()) } else { Err(SolveError::Start { want, got }) }
 }
@@ -77,8 +80,12 @@ fn expect_start(graph: &Graph, start: &[Sim3]) -> Result<(), SolveError> {
 /// the same scale).
 ///
 /// # Errors
-/// [`SolveError`]; running out of iterations is no error but `converged = false`.
-pub fn solve(graph: Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<Solution, SolveError> {
+/// [`ComponentError`]; running out of iterations is no error but `converged = false`.
+pub fn solve<K: Key>(
+    graph: Graph<K>,
+    start: Vec<Sim3>,
+    iterations_max: usize,
+) -> Result<Solution<K>, ComponentError<K>> {
     solve_within(graph, start, iterations_max, FACTOR_BYTES_MAX)
 }
 
@@ -86,18 +93,18 @@ pub fn solve(graph: Graph, start: Vec<Sim3>, iterations_max: usize) -> Result<So
 ///
 /// # Errors
 /// As [`solve`].
-pub fn solve_within(
-    graph: Graph,
+pub fn solve_within<K: Key>(
+    graph: Graph<K>,
     start: Vec<Sim3>,
     iterations_max: usize,
     bytes_max: u64,
-) -> Result<Solution, SolveError> {
+) -> Result<Solution<K>, ComponentError<K>> {
     expect_start(&graph, &start)?;
     let system = System::new(&graph, bytes_max)?;
-    let found = minimise(&system, start, iterations_max).map_err(|error| error.of(&graph))?;
+    let found = minimise(&system, start, iterations_max).map_err(|error| ComponentError::of(error, &graph))?;
     let Minimum { values, cost: chi2, iterations, converged, mut normal } = found;
     normal.at(&system, &values)?;
-    let factor = normal.factorised(&system.pattern).map_err(|error| error.of(&graph))?;
+    let factor = normal.factorised(&system.pattern).map_err(|error| ComponentError::of(error, &graph))?;
     let residuals: usize = graph.edges().iter().map(Edge::dimension).sum();
     let dof = residuals.saturating_sub(system.pattern.scalars());
     let pattern = Arc::new(system.pattern);
@@ -115,8 +122,8 @@ pub(super) enum Part {
 }
 
 /// A graph's χ² with its index bookkeeping: variables of the nodes, and the blocks each factor adds to.
-struct System<'a> {
-    graph: &'a Graph,
+struct System<'a, K: Key> {
+    graph: &'a Graph<K>,
     pattern: BlockPattern,
     terms: Vec<Terms>,
 }
@@ -139,8 +146,8 @@ struct Rigid {
     cross: Option<Slot>,
 }
 
-impl<'a> System<'a> {
-    fn new(graph: &'a Graph, bytes_max: u64) -> Result<Self, SolveError> {
+impl<'a, K: Key> System<'a, K> {
+    fn new(graph: &'a Graph<K>, bytes_max: u64) -> Result<Self, SolveError> {
         let variables: Vec<Variables> = (0..graph.edges().len()).map(|k| Variables::of(graph, k)).collect();
         let mut sizes = vec![6; graph.nodes().len().saturating_sub(1)];
         sizes.resize(sizes.len() + graph.scale_count(), 1);
@@ -181,7 +188,7 @@ impl Terms {
     }
 }
 
-impl Objective for System<'_> {
+impl<K: Key> Objective for System<'_, K> {
     type Values = Vec<Sim3>;
 
     fn pattern(&self) -> &BlockPattern {
@@ -233,7 +240,7 @@ pub(super) struct RigidTerm {
 impl RigidTerm {
     /// With `J_i = −J_j A`, `A = Ad((X_i⁻¹ X_j)⁻¹)`: `H_jj = J_jᵀ W J_j`, `H_ji = −H_jj A`, `H_ii = −Aᵀ H_ji`. `J_j`
     /// and `A` are both `[d u; 0 d]` in blocks of translation and rotation, which spares a third of the products.
-    pub(super) fn new(edge: &Edge, values: &[Sim3]) -> Self {
+    pub(super) fn new<K: Key>(edge: &Edge<K>, values: &[Sim3]) -> Self {
         let (residual, by_j, adjoint) = edge.linearise_rigid(values);
         let (d, u) = (block(&by_j, 0, 0), block(&by_j, 0, 3));
         let w = edge.information_rigid();
@@ -273,7 +280,7 @@ fn joined(tt: &Matrix3<f64>, tr: &Matrix3<f64>, rt: &Matrix3<f64>, rr: &Matrix3<
     out
 }
 
-fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal: &mut Normal) {
+fn add_rigid<K: Key>(edge: &Edge<K>, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal: &mut Normal) {
     let term = RigidTerm::new(edge, values);
     if let Some((start, slot)) = j {
         BlockPattern::add(&mut normal.h, slot, &term.jj);
@@ -288,7 +295,13 @@ fn add_rigid(edge: &Edge, values: &[Sim3], Rigid { i, j, cross }: Rigid, normal:
     }
 }
 
-fn add_bent(bent: &CorrelatedResidual, edge: &Edge, starts: &[Option<usize>], slots: &[Slot], normal: &mut Normal) {
+fn add_bent<K: Key>(
+    bent: &CorrelatedResidual,
+    edge: &Edge<K>,
+    starts: &[Option<usize>],
+    slots: &[Slot],
+    normal: &mut Normal,
+) {
     let information = edge.information_rigid();
     let weighted = information * bent.residual;
     let free: Vec<_> = bent.by.iter().zip(starts).filter_map(|((_, by), start)| Some((by, (*start)?))).collect();
@@ -303,7 +316,7 @@ fn add_bent(bent: &CorrelatedResidual, edge: &Edge, starts: &[Option<usize>], sl
     }
 }
 
-fn add_general(edge: &Edge, values: &[Sim3], parts: &[(usize, Part)], slots: &[Slot], normal: &mut Normal) {
+fn add_general<K: Key>(edge: &Edge<K>, values: &[Sim3], parts: &[(usize, Part)], slots: &[Slot], normal: &mut Normal) {
     let at = edge.linearise(values);
     let information = edge.information();
     let weighted = information * at.residual;
@@ -342,7 +355,7 @@ pub(super) enum Variables {
 }
 
 impl Variables {
-    pub(super) fn of(graph: &Graph, edge: usize) -> Self {
+    pub(super) fn of<K: Key>(graph: &Graph<K>, edge: usize) -> Self {
         let factor = &graph.edges()[edge];
         match graph.correlations.get(&edge) {
             None => Self::Of(variables_of(graph, factor)),
@@ -361,7 +374,7 @@ impl Variables {
 }
 
 /// The variables of a factor: anchors without the first, then scales.
-fn variables_of(graph: &Graph, edge: &Edge) -> Vec<(usize, Part)> {
+fn variables_of<K: Key>(graph: &Graph<K>, edge: &Edge<K>) -> Vec<(usize, Part)> {
     let anchors = graph.nodes().len().saturating_sub(1);
     let end = |node: usize| (node.checked_sub(1), graph.scale_of(node).map(|s| anchors + s));
     parts_of(end(edge.i), end(edge.j)).into_iter().flatten().collect()

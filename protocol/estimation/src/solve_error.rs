@@ -1,24 +1,18 @@
-//! Why a component could not be solved: what the minimiser, the factorisation and the solver say alike.
+//! Why something could not be solved: what the minimiser, the factorisation and the solver say alike, of variables, and
+//! what is told of a graph, in its user's names.
 
-use crate::graph::Graph;
-use crate::ids::{FrameId, SubmapId};
+use crate::graph::{Graph, Key};
 use thiserror::Error;
 
-/// Why a component could not be solved.
+/// Why sparse equations could not be solved.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
 pub enum SolveError {
     /// The measurements leave a variable free, or are too ill-conditioned to tell.
     #[error("variable {variable} of the component is not determined by its measurements")]
     Underconstrained {
-        /// Variable in canonical order (anchors without the first, then scales).
+        /// Its place; of a graph's, in canonical order (nodes without the first, then scales).
         variable: usize,
     },
-    /// The measurements leave a submap's anchor free, or are too ill-conditioned to tell.
-    #[error("submap {0} is not determined by its measurements")]
-    UnderconstrainedAnchor(SubmapId),
-    /// The measurements leave a frame's unit free, or are too ill-conditioned to tell.
-    #[error("the scale of frame {0} is not determined by its measurements")]
-    UnderconstrainedScale(FrameId),
     /// An intermediate number overflowed.
     #[error("numbers overflowed; check the measurements' magnitudes")]
     NotFinite,
@@ -49,23 +43,28 @@ pub enum SolveError {
     OutOfMemory,
 }
 
-impl SolveError {
-    /// The error with its submap named otherwise.
-    #[must_use]
-    pub fn renamed(self, name: impl Fn(SubmapId) -> SubmapId) -> Self {
-        match self {
-            Self::UnderconstrainedAnchor(id) => Self::UnderconstrainedAnchor(name(id)),
-            other => other,
-        }
-    }
+/// Why a component of a graph could not be solved.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+pub enum ComponentError<K: Key> {
+    /// The measurements leave a node free, or are too ill-conditioned to tell.
+    #[error("{0} is not determined by its measurements")]
+    UnderconstrainedNode(K),
+    /// The measurements leave a unit, such as a frame's, free, or are too ill-conditioned to tell.
+    #[error("the scale of frame {0} is not determined by its measurements")]
+    UnderconstrainedScale(K::Unit),
+    /// For a reason that has nothing to do with a single node.
+    #[error(transparent)]
+    Solve(#[from] SolveError),
+}
 
+impl<K: Key> ComponentError<K> {
     /// The error of solving `graph`, with what its variable belongs to.
-    pub(super) fn of(self, graph: &Graph) -> Self {
-        let Self::Underconstrained { variable } = self else { return self };
-        let anchors = graph.nodes().len().saturating_sub(1);
-        let anchor = graph.nodes().get(variable + 1).map(|&id| Self::UnderconstrainedAnchor(id));
-        let has_scale = |k: &usize| variable >= anchors && graph.scale_of(*k) == Some(variable - anchors);
-        let scale = || (0..graph.nodes().len()).find(has_scale).map(|k| graph.nodes()[k].frame);
-        anchor.or_else(|| scale().map(Self::UnderconstrainedScale)).unwrap_or(self)
+    pub(super) fn of(error: SolveError, graph: &Graph<K>) -> Self {
+        let SolveError::Underconstrained { variable } = error else { return Self::Solve(error) };
+        let free = graph.nodes().len().saturating_sub(1);
+        let node = graph.nodes().get(variable + 1).map(|&node| Self::UnderconstrainedNode(node));
+        let has_scale = |k: &usize| variable >= free && graph.scale_of(*k) == Some(variable - free);
+        let scale = || (0..graph.nodes().len()).find(has_scale).map(|k| graph.nodes()[k].unit());
+        node.or_else(|| scale().map(Self::UnderconstrainedScale)).unwrap_or(Self::Solve(error))
     }
 }

@@ -1,8 +1,8 @@
 //! The solver against truth, its own covariances, published optima, and hostile input.
 
-use super::graph::{Factor, Graph, GraphError, Label};
+use super::graph::{Factor, Graph, GraphError, Source};
 use super::reweight::{LeftOut, leave_one_out};
-use super::solve::{FACTOR_BYTES_MAX, Solution, SolveError, minimum, solve};
+use super::solve::{ComponentError, FACTOR_BYTES_MAX, Solution, SolveError, minimum, solve};
 use super::test_graphs::*;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
 use crate::ids::SubmapId;
@@ -12,7 +12,7 @@ use rand::seq::SliceRandom;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A closed walk with loop closures: truth and noisy (or exact) factors.
-fn walk(seed: u64, anchors: usize, exact: bool) -> (BTreeMap<SubmapId, Se3>, Vec<Factor>) {
+fn walk(seed: u64, anchors: usize, exact: bool) -> (BTreeMap<SubmapId, Se3>, Vec<Factor<SubmapId>>) {
     let rng = &mut rng(seed);
     let mut poses = vec![any_pose(rng, 5.0)];
     for _ in 1..anchors {
@@ -24,7 +24,7 @@ fn walk(seed: u64, anchors: usize, exact: bool) -> (BTreeMap<SubmapId, Se3>, Vec
         let truth = poses[i].inverse() * poses[j];
         let t = if exact { PoseWithCovariance { pose: truth, covariance } } else { measured(rng, &truth, covariance) };
         let t_i_j = Relative::Metric(t);
-        factors.push(Factor { label: Label::Odometry, i: submap(0, i), j: submap(0, j), t_i_j, weight: 1.0 });
+        factors.push(Factor { label: Source::Odometry, i: submap(0, i), j: submap(0, j), t_i_j, weight: 1.0 });
     };
     for k in 1..anchors {
         add(k - 1, k, sigmas(0.03, 0.01));
@@ -35,7 +35,7 @@ fn walk(seed: u64, anchors: usize, exact: bool) -> (BTreeMap<SubmapId, Se3>, Vec
     (poses.into_iter().enumerate().map(|(k, t)| (submap(0, k), t)).collect(), factors)
 }
 
-fn one_component(truth: &BTreeMap<SubmapId, Se3>, factors: Vec<Factor>) -> Graph {
+fn one_component(truth: &BTreeMap<SubmapId, Se3>, factors: Vec<Factor<SubmapId>>) -> Graph<SubmapId> {
     let nodes = truth.keys().copied().collect();
     Graph::components(&nodes, &BTreeSet::new(), factors).unwrap().remove(0)
 }
@@ -45,7 +45,7 @@ fn perturbed(seed: u64, truth: &BTreeMap<SubmapId, Se3>, rho: f64, phi: f64) -> 
     truth.values().map(|t| Sim3::from_se3(&measured(rng, t, sigmas(rho, phi)).pose)).collect()
 }
 
-fn bits(solution: &Solution) -> Vec<u64> {
+fn bits(solution: &Solution<SubmapId>) -> Vec<u64> {
     let numbers =
         |s: &Sim3| s.translation.iter().copied().chain(s.rotation.xyzw()).map(f64::to_bits).collect::<Vec<_>>();
     solution.values().iter().flat_map(numbers).chain([solution.chi2.to_bits()]).collect()
@@ -101,7 +101,7 @@ fn jacobians_match_finite_differences() {
                 Relative::Metric(PoseWithCovariance { pose: t.to_se3(), covariance: sigmas(0.1, 0.1) })
             };
             let unknown = if scaled { BTreeSet::from([frame(1)]) } else { BTreeSet::new() };
-            let factor = Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 };
+            let factor = Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 };
             let graph = Graph::components(&BTreeSet::from([i, j]), &unknown, vec![factor]).unwrap().remove(0);
             let edge = &graph.edges()[0];
             let exact = edge.linearise(&values);
@@ -210,7 +210,7 @@ fn scale_of_a_frame_of_unknown_unit_is_recovered() {
                     let own = Se3::new(step.rotation, step.translation / s);
                     let t_i_j = Relative::Metric(PoseWithCovariance { pose: own, covariance: sigmas(0.02 / s, 0.01) });
                     let (i, j) = (submap(robot, k - 1), submap(robot, k));
-                    factors.push(Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 });
+                    factors.push(Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 });
                 }
                 truth.insert(submap(robot, k), Sim3::new(pose.rotation, pose.translation, s));
             }
@@ -219,7 +219,7 @@ fn scale_of_a_frame_of_unknown_unit_is_recovered() {
             let sim = truth[&i].inverse() * truth[&j];
             let covariance = Covariance::from_sigmas([0.05, 0.05, 0.05, 0.01, 0.01, 0.01, 0.02]).unwrap();
             let t_i_j = Relative::Similarity(SimWithCovariance { sim, covariance });
-            factors.push(Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 });
+            factors.push(Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 });
         }
         let nodes = truth.keys().copied().collect();
         let graph = Graph::components(&nodes, &unknown, factors).unwrap().remove(0);
@@ -252,7 +252,7 @@ fn scale_of_a_frame_of_unknown_unit_is_recovered() {
 #[test]
 fn components_stay_apart() {
     let (truth, factors) = walk(7, 10, false);
-    let cut = |f: &Factor| (f.i.index < 5) == (f.j.index < 5);
+    let cut = |f: &Factor<SubmapId>| (f.i.index < 5) == (f.j.index < 5);
     let factors: Vec<_> = factors.into_iter().filter(cut).collect();
     let nodes = truth.keys().copied().collect();
     let graphs = Graph::components(&nodes, &BTreeSet::new(), factors).unwrap();
@@ -276,7 +276,7 @@ fn a_lone_anchor_is_a_solved_component() {
 fn bad_factors_are_named() {
     let (truth, factors) = walk(9, 4, true);
     let nodes: BTreeSet<_> = truth.keys().copied().collect();
-    let with = |change: &dyn Fn(&mut Factor)| {
+    let with = |change: &dyn Fn(&mut Factor<SubmapId>)| {
         let mut bad = factors.clone();
         change(&mut bad[1]);
         Graph::components(&nodes, &BTreeSet::new(), bad).map(|_| ()).unwrap_err()
@@ -298,7 +298,7 @@ fn bad_factors_are_named() {
     );
     assert_eq!(units.unwrap_err(), GraphError::Units { i, j: submap(1, 0) });
     let graph = one_component(&truth, factors);
-    assert_eq!(solve(graph, Vec::new(), 5).unwrap_err(), SolveError::Start { want: 4, got: 0 });
+    assert_eq!(solve(graph, Vec::new(), 5).unwrap_err(), SolveError::Start { want: 4, got: 0 }.into());
 }
 
 /// χ² at GTSAM's Levenberg–Marquardt optimum of the same geodesic cost.
@@ -320,8 +320,7 @@ fn published_graphs_reach_their_optimum() {
 #[test]
 fn leave_one_out_equals_the_innovation_against_the_map_without_the_factor() {
     let (truth, mut factors) = walk(17, 16, false);
-    let entry = crate::ids::EntryId { frame: frame(0), seq: 0 };
-    factors.last_mut().unwrap().label = Label::Alignment(entry);
+    factors.last_mut().unwrap().label = Source::Measurement(0);
     let tested = *factors.last().unwrap();
     let start = perturbed(17, &truth, 0.02, 0.01);
     let with = solve(one_component(&truth, factors.clone()), start.clone(), 50).unwrap();
@@ -341,7 +340,7 @@ fn a_graph_that_is_tied_all_over_is_refused_before_it_takes_memory() {
     let t_i_j = Relative::Metric(PoseWithCovariance { pose: Se3::identity(), covariance: sigmas(0.1, 0.1) });
     let factor = |(i, j): (usize, usize)| {
         let (i, j) = (submap(0, i), submap(0, j));
-        Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 }
+        Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 }
     };
     let chain = (1..poses).map(|k| (k - 1, k)).collect::<Vec<_>>();
     let random = (0..3 * poses).map(|_| (rng.random_range(0..poses), rng.random_range(0..poses)));
@@ -350,7 +349,7 @@ fn a_graph_that_is_tied_all_over_is_refused_before_it_takes_memory() {
     let graph = Graph::components(&nodes, &BTreeSet::new(), factors).unwrap().remove(0);
     let start = vec![Sim3::identity(); poses];
     let error = solve(graph.clone(), start.clone(), 5).unwrap_err();
-    assert!(matches!(error, SolveError::TooDense { limit: FACTOR_BYTES_MAX, .. }), "{error}");
+    assert!(matches!(error, ComponentError::Solve(SolveError::TooDense { limit: FACTOR_BYTES_MAX, .. })), "{error}");
     assert_eq!(minimum(&graph, start, 5).unwrap_err(), error);
     assert!(error.to_string().contains("4096 are allowed"), "{error}");
 }
@@ -360,7 +359,7 @@ fn what_is_not_determined_is_named_by_its_submap_or_frame() {
     let graph = {
         let sim = SimWithCovariance { sim: Sim3::identity(), covariance: Covariance::from_sigmas([0.1; 7]).unwrap() };
         let rigid = PoseWithCovariance { pose: Se3::identity(), covariance: sigmas(0.1, 0.1) };
-        let factor = |i, j, t_i_j| Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 };
+        let factor = |i, j, t_i_j| Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 };
         let factors = vec![
             factor(submap(0, 0), submap(1, 0), Relative::Similarity(sim)),
             factor(submap(1, 0), submap(1, 1), Relative::Metric(rigid)),
@@ -368,11 +367,10 @@ fn what_is_not_determined_is_named_by_its_submap_or_frame() {
         let nodes = [submap(0, 0), submap(1, 0), submap(1, 1)].into();
         Graph::components(&nodes, &[frame(1)].into(), factors).unwrap().remove(0)
     };
-    let of = |variable| SolveError::Underconstrained { variable }.of(&graph);
-    assert_eq!(of(0), SolveError::UnderconstrainedAnchor(submap(1, 0)));
-    assert_eq!(of(1), SolveError::UnderconstrainedAnchor(submap(1, 1)));
-    assert_eq!(of(2), SolveError::UnderconstrainedScale(frame(1)));
-    assert_eq!(of(3), SolveError::Underconstrained { variable: 3 });
-    assert_eq!(SolveError::NotFinite.of(&graph), SolveError::NotFinite);
-    assert_eq!(of(0).renamed(|id| SubmapId { index: 7, ..id }), SolveError::UnderconstrainedAnchor(submap(1, 7)));
+    let of = |variable| ComponentError::of(SolveError::Underconstrained { variable }, &graph);
+    assert_eq!(of(0), ComponentError::UnderconstrainedNode(submap(1, 0)));
+    assert_eq!(of(1), ComponentError::UnderconstrainedNode(submap(1, 1)));
+    assert_eq!(of(2), ComponentError::UnderconstrainedScale(frame(1)));
+    assert_eq!(of(3), ComponentError::Solve(SolveError::Underconstrained { variable: 3 }));
+    assert_eq!(ComponentError::of(SolveError::NotFinite, &graph), SolveError::NotFinite.into());
 }

@@ -7,7 +7,7 @@
     reason = "tests of this crate and of the core use it, and nothing else"
 )]
 
-use super::graph::{Factor, Label};
+use super::graph::{Factor, Source};
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, So3};
 use crate::ids::{FrameId, RobotId, SubmapId};
 use nalgebra::{Matrix6, Vector3, Vector6};
@@ -60,7 +60,7 @@ pub fn measured(rng: &mut ChaCha8Rng, truth: &Se3, covariance: Covariance<6>) ->
 }
 
 /// Reads `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT` lines; every vertex becomes an anchor of one frame.
-pub fn read_g2o(text: &str) -> (Vec<(SubmapId, Se3)>, Vec<Factor>) {
+pub fn read_g2o(text: &str) -> (Vec<(SubmapId, Se3)>, Vec<Factor<SubmapId>>) {
     let (mut nodes, mut factors) = (Vec::new(), Vec::new());
     for line in text.lines() {
         let mut words = line.split_whitespace();
@@ -87,7 +87,7 @@ pub fn read_g2o(text: &str) -> (Vec<(SubmapId, Se3)>, Vec<Factor>) {
                 let covariance = Covariance::new((inverse + inverse.transpose()) * 0.5).unwrap();
                 let t_i_j = Relative::Metric(PoseWithCovariance { pose, covariance });
                 factors.push(Factor {
-                    label: Label::Odometry,
+                    label: Source::Odometry,
                     i: submap(0, ids[0]),
                     j: submap(0, ids[1]),
                     t_i_j,

@@ -6,7 +6,9 @@ use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
 use crate::estimate::extrapolation::End;
 use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, Shortfall, Unused, solve_map};
+use crate::estimate::node::Node;
 use crate::estimate::optimality::Optimality;
+use crate::estimate::solve::ComponentError;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use crate::submap::landmarks::{self, LandmarkConfig, LandmarkError};
@@ -134,13 +136,13 @@ impl Solved {
                 (*i, *j) = (index(*i), index(*j));
             }
             for edge in &mut self.edges {
-                if let Some(Unused::Failed(error)) = &mut edge.unused {
-                    *error = error.renamed(index);
+                if let Some(Unused::Failed(ComponentError::UnderconstrainedNode(node))) = &mut edge.unused {
+                    *node = Node::Anchor(index(node.submap()));
                 }
             }
             for (_, why) in &mut self.failed {
-                if let Shortfall::Unsolved(error) = why {
-                    *error = error.renamed(index);
+                if let Shortfall::Unsolved(ComponentError::UnderconstrainedNode(node)) = why {
+                    *node = Node::Anchor(index(node.submap()));
                 }
             }
         }

@@ -7,7 +7,7 @@ use super::estimation::{estimate_version, live_robots, pair_views, robot_view};
 use super::replication::knowledge::Agreement;
 use crate::estimate::EdgeKind;
 use crate::estimate::joint::Shortfall;
-use crate::estimate::solve::SolveError;
+use crate::estimate::solve::ComponentError;
 use crate::geometry::Se3;
 use crate::ids::{EntryId, FrameId, RobotId};
 use crate::snapshot::{
@@ -210,10 +210,11 @@ impl Agent {
     fn shortfall(&self, why: &Shortfall) -> String {
         let text = why.to_string();
         match why {
-            Shortfall::Unsolved(SolveError::UnderconstrainedAnchor(id)) => {
-                text.replace(&id.to_string(), &self.context.submap_name(*id))
+            Shortfall::Unsolved(ComponentError::UnderconstrainedNode(node)) => {
+                let id = node.submap();
+                text.replace(&id.to_string(), &self.context.submap_name(id))
             }
-            Shortfall::Unsolved(SolveError::UnderconstrainedScale(frame)) => {
+            Shortfall::Unsolved(ComponentError::UnderconstrainedScale(frame)) => {
                 text.replace(&frame.to_string(), &self.context.frame_name(*frame))
             }
             _ => text,

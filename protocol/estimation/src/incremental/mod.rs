@@ -15,13 +15,12 @@ mod plan;
 #[cfg(test)]
 mod tests;
 
-use super::graph::{Factor, GraphError};
-use super::marginals::{certain, is_rigid, relation};
+use super::graph::{Factor, GraphError, Key, is_rigid};
+use super::marginals::{certain, relation};
 use super::solve::{Solution, SolveError};
 use super::sparse::{Before, CliqueTree};
 use crate::geometry::sim3::Matrix7;
 use crate::geometry::{Relative, Sim3};
-use crate::ids::{FrameId, SubmapId};
 use model::{Model, Owner};
 use plan::Plan;
 use std::collections::BTreeSet;
@@ -41,25 +40,25 @@ const STEPS_MAX: usize = 30;
 
 /// Why a component was left as it was.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
-pub enum IncrementalError {
+pub enum IncrementalError<K: Key> {
     /// A factor cannot be used.
     #[error(transparent)]
-    Graph(#[from] GraphError),
+    Graph(#[from] GraphError<K>),
     /// An anchor is there already.
     #[error("anchor {0:?} is already in the component; leave it out of the addition")]
-    Known(SubmapId),
+    Known(K),
     /// No factor ties an anchor to the component, by way of others or at all.
     #[error("anchor {0:?} is tied to nothing known; add it with a factor that leads there")]
-    Loose(SubmapId),
+    Loose(K),
     /// A frame's unit would change what the units of the others are.
     #[error("the unit of frame {0:?} contradicts the component's; solve it anew with the frame")]
-    Unit(FrameId),
+    Unit(K::Unit),
     /// The measurements leave an anchor free, or are too ill-conditioned to tell.
     #[error("anchor {0:?} is not determined by its measurements")]
-    Underconstrained(SubmapId),
+    Underconstrained(K),
     /// The measurements leave a frame's scale free, or are too ill-conditioned to tell.
     #[error("the scale of frame {0:?} is not determined by its measurements")]
-    UnderconstrainedScale(FrameId),
+    UnderconstrainedScale(K::Unit),
     /// An intermediate number overflowed, or memory could not be had.
     #[error(transparent)]
     Solve(SolveError),
@@ -69,14 +68,20 @@ pub enum IncrementalError {
 }
 
 /// What a component shall grow by.
-#[derive(Clone, Debug, Default)]
-pub struct Addition {
+#[derive(Clone, Debug)]
+pub struct Addition<K: Key> {
     /// New anchors; each must be tied to the component by `factors`.
-    pub nodes: BTreeSet<SubmapId>,
+    pub nodes: BTreeSet<K>,
     /// New frames whose scale is not known.
-    pub unknown_scale: BTreeSet<FrameId>,
+    pub unknown_scale: BTreeSet<K::Unit>,
     /// New factors, among new and known anchors.
-    pub factors: Vec<Factor>,
+    pub factors: Vec<Factor<K>>,
+}
+
+impl<K: Key> Default for Addition<K> {
+    fn default() -> Self {
+        Self { nodes: BTreeSet::new(), unknown_scale: BTreeSet::new(), factors: Vec::new() }
+    }
 }
 
 /// What an addition cost.
@@ -98,8 +103,8 @@ pub struct Update {
 
 /// A component that grows.
 #[derive(Debug)]
-pub struct Incremental {
-    model: Model,
+pub struct Incremental<K: Key> {
+    model: Model<K>,
     tree: CliqueTree,
     /// Numbers a scalar that the factor held when its order was last made.
     fill: f64,
@@ -114,12 +119,12 @@ struct Saved {
     solution: Vec<f64>,
 }
 
-impl Incremental {
+impl<K: Key> Incremental<K> {
     /// Takes over a solved component; `unknown_scale` as it was for [`super::graph::Graph::components`].
     ///
     /// # Errors
     /// [`IncrementalError::Underconstrained`] if the component's factorisation fails here.
-    pub fn new(solution: Solution, unknown_scale: &BTreeSet<FrameId>) -> Result<Self, IncrementalError> {
+    pub fn new(solution: Solution<K>, unknown_scale: &BTreeSet<K::Unit>) -> Result<Self, IncrementalError<K>> {
         let Solution { graph, values, pattern, factor, .. } = solution;
         drop((pattern, factor));
         let (mut model, mut tree) = (Model::default(), CliqueTree::default());
@@ -131,7 +136,7 @@ impl Incremental {
             model.owners.push(Owner::Anchor(k + 1));
             tree.add_variable(6);
         }
-        let scales: BTreeSet<(usize, FrameId)> =
+        let scales: BTreeSet<(usize, K::Unit)> =
             model.frames.iter().filter_map(|(&id, frame)| Some((frame.scale?, id))).collect();
         for (_, frame) in scales {
             model.owners.push(Owner::Scale(frame));
@@ -154,12 +159,12 @@ impl Incremental {
     }
 
     /// The anchors with their estimates `t_world_anchor`: first the solution's, then in the order of addition.
-    pub fn values(&self) -> impl ExactSizeIterator<Item = (SubmapId, &Sim3)> {
+    pub fn values(&self) -> impl ExactSizeIterator<Item = (K, &Sim3)> {
         self.model.nodes.iter().map(|node| node.id).zip(&self.model.estimates)
     }
 
     /// The estimate `t_world_anchor` of an anchor.
-    pub fn value(&self, id: SubmapId) -> Option<&Sim3> {
+    pub fn value(&self, id: K) -> Option<&Sim3> {
         self.model.estimates.get(*self.model.index.get(&id)?)
     }
 
@@ -177,7 +182,7 @@ impl Incremental {
     ///
     /// # Errors
     /// [`IncrementalError`]; the component is as it was then.
-    pub fn add(&mut self, addition: Addition) -> Result<Update, IncrementalError> {
+    pub fn add(&mut self, addition: Addition<K>) -> Result<Update, IncrementalError<K>> {
         let plan = self.model.plan(addition)?;
         self.reversibly(|this| this.grow(plan))
     }
@@ -187,7 +192,7 @@ impl Incremental {
     ///
     /// # Errors
     /// [`IncrementalError`]; the component is as it was then.
-    pub fn settle(&mut self) -> Result<usize, IncrementalError> {
+    pub fn settle(&mut self) -> Result<usize, IncrementalError<K>> {
         self.reversibly(|this| {
             this.save();
             let mut chi2 = this.chi2();
@@ -216,7 +221,7 @@ impl Incremental {
 
     /// `t_i_j` between two anchors with the covariance of its local perturbation, as [`Solution::relative`] has it,
     /// drawn at the linearisation points. `None` for anchors that are not here.
-    pub fn relative(&self, i: SubmapId, j: SubmapId, unknown_scale: &BTreeSet<FrameId>) -> Option<Relative> {
+    pub fn relative(&self, i: K, j: K, unknown_scale: &BTreeSet<K::Unit>) -> Option<Relative> {
         let model = &self.model;
         let (a, b) = (*model.index.get(&i)?, *model.index.get(&j)?);
         if a == b {
@@ -230,11 +235,14 @@ impl Incremental {
             rows.extend(node.anchor.iter().flat_map(|&v| (0..6).map(move |k| (v, k, by_delta.column(k).into_owned()))));
             rows.extend(node.scale.map(|v| (v, 0, by_delta.column(6).into_owned())));
         }
-        relation(t_i_j, self.tree.covariance(&rows), is_rigid(i.frame, j.frame, unknown_scale))
+        relation(t_i_j, self.tree.covariance(&rows), is_rigid(i.unit(), j.unit(), unknown_scale))
     }
 
     /// Does something, or leaves everything as it was.
-    fn reversibly<T>(&mut self, change: impl FnOnce(&mut Self) -> Result<T, Failure>) -> Result<T, IncrementalError> {
+    fn reversibly<T>(
+        &mut self,
+        change: impl FnOnce(&mut Self) -> Result<T, Failure>,
+    ) -> Result<T, IncrementalError<K>> {
         let model = &self.model;
         let sizes = (model.nodes.len(), model.edges.len(), model.owners.len());
         let (before, fill): (Before, f64) = (self.tree.before(), self.fill);
@@ -271,7 +279,7 @@ impl Incremental {
         });
     }
 
-    fn grow(&mut self, plan: Plan) -> Result<Update, Failure> {
+    fn grow(&mut self, plan: Plan<K>) -> Result<Update, Failure> {
         let (known, known_edges) = (self.model.nodes.len(), self.model.edges.len());
         let hung: Vec<(usize, usize)> = plan.hung.iter().map(|(n, e)| (known + n, known_edges + e)).collect();
         let mut is_hung = vec![false; plan.nodes.len() + plan.edges.len()];
@@ -312,14 +320,14 @@ impl Incremental {
     }
 
     /// Appends anchors, scales and factors; returns the new variables and terms.
-    fn push(&mut self, plan: Plan) -> (Vec<usize>, core::ops::Range<usize>) {
+    fn push(&mut self, plan: Plan<K>) -> (Vec<usize>, core::ops::Range<usize>) {
         let Self { model, tree, .. } = self;
         let (first_variable, first_term) = (model.owners.len(), model.edges.len());
         model.unknown_scale.extend(&plan.scales);
         for (id, point) in plan.nodes {
-            let is_new_scale = plan.scales.contains(&id.frame) && !model.frames.contains_key(&id.frame);
+            let is_new_scale = plan.scales.contains(&id.unit()) && !model.frames.contains_key(&id.unit());
             let scale = is_new_scale.then(|| {
-                model.owners.push(Owner::Scale(id.frame));
+                model.owners.push(Owner::Scale(id.unit()));
                 tree.add_variable(1)
             });
             model.owners.push(Owner::Anchor(model.nodes.len()));
@@ -388,7 +396,7 @@ impl From<SolveError> for Failure {
 }
 
 /// An error in terms of anchors and frames.
-fn named(model: &Model, error: SolveError) -> IncrementalError {
+fn named<K: Key>(model: &Model<K>, error: SolveError) -> IncrementalError<K> {
     let owner = match error {
         SolveError::Underconstrained { variable } => model.owners.get(variable),
         _ => None,

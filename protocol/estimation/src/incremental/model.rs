@@ -3,12 +3,11 @@
 //! An anchor's estimate is its linearisation point moved by δ: `R exp(φ)`, `p + s R ρ`. Moved so, a whole robot's
 //! translation is linear exactly, and only rotations age a linearisation.
 
-use super::super::graph::Edge;
+use super::super::graph::{Edge, Key};
 use super::super::solve::{Part, RigidTerm, columns, parts_of};
 use super::super::sparse::{CliqueTree, Sum, Terms};
 use crate::geometry::sim3::{Matrix7, Vector7};
 use crate::geometry::{Sim3, So3, so3};
-use crate::ids::{FrameId, SubmapId};
 use nalgebra::{SMatrix, Vector3};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,23 +17,23 @@ pub(super) const ROTATION_MAX: f64 = 0.02;
 pub(super) const DEFECT_MAX: f64 = 0.01;
 
 /// Anchors, factors and linearisation points of one component.
-#[derive(Debug, Default)]
-pub(super) struct Model {
-    pub(super) nodes: Vec<Node>,
-    pub(super) index: BTreeMap<SubmapId, usize>,
-    pub(super) unknown_scale: BTreeSet<FrameId>,
-    pub(super) frames: BTreeMap<FrameId, Frame>,
-    pub(super) edges: Vec<Edge>,
+#[derive(Debug)]
+pub(super) struct Model<K: Key> {
+    pub(super) nodes: Vec<Node<K>>,
+    pub(super) index: BTreeMap<K, usize>,
+    pub(super) unknown_scale: BTreeSet<K::Unit>,
+    pub(super) frames: BTreeMap<K::Unit, Frame>,
+    pub(super) edges: Vec<Edge<K>>,
     /// By node: where its factors are linearised.
     pub(super) points: Vec<Sim3>,
     pub(super) estimates: Vec<Sim3>,
     /// By variable.
-    pub(super) owners: Vec<Owner>,
+    pub(super) owners: Vec<Owner<K::Unit>>,
 }
 
 #[derive(Debug)]
-pub(super) struct Node {
-    pub(super) id: SubmapId,
+pub(super) struct Node<K> {
+    pub(super) id: K,
     /// Its variable; `None` for the anchor held fixed.
     pub(super) anchor: Option<usize>,
     /// The scale variable of its frame.
@@ -51,16 +50,31 @@ pub(super) struct Frame {
 
 /// Whose variable it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Owner {
+pub(super) enum Owner<U> {
     Anchor(usize),
-    Scale(FrameId),
+    Scale(U),
 }
 
-impl Model {
+impl<K: Key> Default for Model<K> {
+    fn default() -> Self {
+        Self {
+            nodes: Vec::new(),
+            index: BTreeMap::new(),
+            unknown_scale: BTreeSet::new(),
+            frames: BTreeMap::new(),
+            edges: Vec::new(),
+            points: Vec::new(),
+            estimates: Vec::new(),
+            owners: Vec::new(),
+        }
+    }
+}
+
+impl<K: Key> Model<K> {
     /// An anchor with its estimate as linearisation point; a new frame in `unknown_scale` has `scale` as its variable.
-    pub(super) fn push_node(&mut self, id: SubmapId, point: Sim3, anchor: Option<usize>, scale: Option<usize>) {
+    pub(super) fn push_node(&mut self, id: K, point: Sim3, anchor: Option<usize>, scale: Option<usize>) {
         let node = self.nodes.len();
-        let frame = self.frames.entry(id.frame).or_insert_with(|| Frame { scale, nodes: Vec::new() });
+        let frame = self.frames.entry(id.unit()).or_insert_with(|| Frame { scale, nodes: Vec::new() });
         frame.nodes.push(node);
         self.index.insert(id, node);
         self.nodes.push(Node { id, anchor, scale: frame.scale, edges: Vec::new() });
@@ -69,14 +83,14 @@ impl Model {
     }
 
     /// The factors that there are at first, which are too many to be moved.
-    pub(super) fn take_edges(&mut self, edges: Vec<Edge>) {
+    pub(super) fn take_edges(&mut self, edges: Vec<Edge<K>>) {
         for (k, edge) in edges.iter().enumerate() {
             [edge.i, edge.j].into_iter().for_each(|node| self.nodes[node].edges.push(k));
         }
         self.edges = edges;
     }
 
-    pub(super) fn push_edge(&mut self, edge: Edge) {
+    pub(super) fn push_edge(&mut self, edge: Edge<K>) {
         for node in [edge.i, edge.j] {
             self.nodes[node].edges.push(self.edges.len());
         }
@@ -87,7 +101,7 @@ impl Model {
     pub(super) fn truncate(&mut self, nodes: usize, edges: usize, variables: usize) {
         for node in self.nodes.drain(nodes..) {
             self.index.remove(&node.id);
-            if let Some(frame) = self.frames.get_mut(&node.id.frame) {
+            if let Some(frame) = self.frames.get_mut(&node.id.unit()) {
                 frame.nodes.retain(|&k| k < nodes);
             }
         }
@@ -175,7 +189,7 @@ impl Model {
     /// moved. Returns all whose point moved, ascending.
     pub(super) fn relinearise(&mut self, tree: &mut CliqueTree, nodes: &[usize]) -> Vec<usize> {
         let mut all: BTreeSet<usize> = nodes.iter().copied().collect();
-        let frames: BTreeSet<FrameId> = nodes.iter().map(|&node| self.nodes[node].id.frame).collect();
+        let frames: BTreeSet<K::Unit> = nodes.iter().map(|&node| self.nodes[node].id.unit()).collect();
         for frame in frames.iter().filter_map(|frame| self.frames.get(frame)) {
             if let Some(scale) = frame.scale.filter(|&v| tree.solution(v) != [0.0]) {
                 all.extend(&frame.nodes);
@@ -191,7 +205,7 @@ impl Model {
 
     /// What [`Model::defect`] cannot much exceed, at a tenth of its cost: the terms of second order, each as large as
     /// it can be. `None` where scales moved.
-    pub(super) fn defect_bound(&self, tree: &CliqueTree, edge: &Edge) -> Option<f64> {
+    pub(super) fn defect_bound(&self, tree: &CliqueTree, edge: &Edge<K>) -> Option<f64> {
         let ((rho_i, phi_i, scale_i), (rho_j, phi_j, scale_j)) = (self.delta(tree, edge.i), self.delta(tree, edge.j));
         if scale_i != 0.0 || scale_j != 0.0 {
             return None;
@@ -202,7 +216,7 @@ impl Model {
     }
 
     /// By how many standard deviations the linear residual is off.
-    pub(super) fn defect(&self, tree: &CliqueTree, edge: &Edge) -> f64 {
+    pub(super) fn defect(&self, tree: &CliqueTree, edge: &Edge<K>) -> f64 {
         let at = edge.linearise(&self.points);
         let tangent = |node: usize| {
             let (rho, phi, lambda) = self.delta(tree, node);
@@ -223,13 +237,13 @@ impl Model {
         out
     }
 
-    fn parts(&self, edge: &Edge) -> [Option<(usize, Part)>; 4] {
+    fn parts(&self, edge: &Edge<K>) -> [Option<(usize, Part)>; 4] {
         let end = |node: usize| (self.nodes[node].anchor, self.nodes[node].scale);
         parts_of(end(edge.i), end(edge.j))
     }
 }
 
-impl Terms for Model {
+impl<K: Key> Terms for Model<K> {
     fn variables(&self, term: usize) -> impl Iterator<Item = usize> {
         self.parts(&self.edges[term]).into_iter().flatten().map(|(variable, _)| variable)
     }

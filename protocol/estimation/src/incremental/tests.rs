@@ -1,10 +1,11 @@
 //! A component that grows against batch solves, at each step; what a step touches; bad additions.
 
-use super::super::graph::{Graph, Label};
+use super::super::graph::{Graph, Source};
 use super::super::solve::solve;
 use super::super::test_graphs::*;
 use super::*;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, SimWithCovariance};
+use crate::ids::{FrameId, SubmapId};
 use proptest::prelude::*;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -20,7 +21,7 @@ struct Growth {
     truth: BTreeMap<SubmapId, Sim3>,
     unknown: BTreeSet<FrameId>,
     nodes: BTreeSet<SubmapId>,
-    factors: Vec<Factor>,
+    factors: Vec<Factor<SubmapId>>,
 }
 
 impl Growth {
@@ -31,7 +32,7 @@ impl Growth {
     }
 
     /// `count` more anchors of a robot, in one addition; loops with probability `loops` each.
-    fn drive(&mut self, robot: u8, count: usize, loops: f64) -> Addition {
+    fn drive(&mut self, robot: u8, count: usize, loops: f64) -> Addition<SubmapId> {
         let mut addition = Addition { unknown_scale: self.unknown.clone(), ..Addition::default() };
         for _ in 0..count {
             let index = self.truth.keys().filter(|id| id.frame == frame(robot)).count();
@@ -61,14 +62,14 @@ impl Growth {
     }
 
     /// A measurement of `id` from another anchor.
-    fn tie(&mut self, id: SubmapId) -> Option<Factor> {
+    fn tie(&mut self, id: SubmapId) -> Option<Factor<SubmapId>> {
         let others: Vec<SubmapId> = self.truth.keys().copied().filter(|&other| other != id).collect();
         let other = others[self.rng.random_range(0..others.len())];
         let is_new = |(i, j)| !self.factors.iter().any(|f| (f.i, f.j) == (i, j));
         is_new((other, id)).then(|| self.measure(other, id))
     }
 
-    fn measure(&mut self, i: SubmapId, j: SubmapId) -> Factor {
+    fn measure(&mut self, i: SubmapId, j: SubmapId) -> Factor<SubmapId> {
         let truth = self.truth[&i].inverse() * self.truth[&j];
         let rigid = is_rigid(i.frame, j.frame, &self.unknown);
         let t_i_j = if rigid {
@@ -79,10 +80,10 @@ impl Growth {
             let covariance = Covariance::from_sigmas(sigmas).unwrap();
             Relative::Similarity(SimWithCovariance { sim: truth.retract(&delta), covariance })
         };
-        Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 }
+        Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 }
     }
 
-    fn batch(&self, values: &BTreeMap<SubmapId, Sim3>) -> Solution {
+    fn batch(&self, values: &BTreeMap<SubmapId, Sim3>) -> Solution<SubmapId> {
         let mut graphs = Graph::components(&self.nodes, &self.unknown, self.factors.clone()).unwrap();
         assert_eq!(graphs.len(), 1);
         let start = self.nodes.iter().map(|id| values[id]).collect();
@@ -92,7 +93,7 @@ impl Growth {
     }
 
     /// How far the grown estimate lies from a batch solve from the truth, in standard deviations.
-    fn apart(&self, grown: &Incremental) -> f64 {
+    fn apart(&self, grown: &Incremental<SubmapId>) -> f64 {
         let batch = self.batch(&self.truth);
         let first = batch.graph().nodes()[0];
         let origin = grown.value(first).unwrap().inverse();
@@ -107,12 +108,12 @@ impl Growth {
     }
 }
 
-fn started(growth: &mut Growth, anchors: usize) -> Incremental {
+fn started(growth: &mut Growth, anchors: usize) -> Incremental<SubmapId> {
     growth.drive(0, anchors, 0.3);
     Incremental::new(growth.batch(&growth.truth), &growth.unknown).unwrap()
 }
 
-fn bits(grown: &Incremental) -> Vec<u64> {
+fn bits(grown: &Incremental<SubmapId>) -> Vec<u64> {
     let of = |(_, s): (SubmapId, &Sim3)| {
         let numbers = s.translation.iter().copied().chain(s.rotation.xyzw()).chain([s.scale]);
         numbers.map(f64::to_bits).collect::<Vec<_>>()
@@ -161,18 +162,19 @@ proptest! {
 }
 
 /// The addition with something wrong each time; the last two come out only once it is solved for.
-fn spoiled(addition: &Addition) -> Vec<Addition> {
+fn spoiled(addition: &Addition<SubmapId>) -> Vec<Addition<SubmapId>> {
     let stray = SubmapId { index: 1000, ..*addition.nodes.first().unwrap() };
     let last = *addition.factors.last().unwrap();
-    let with = |change: &dyn Fn(&mut Addition)| {
+    let with = |change: &dyn Fn(&mut Addition<SubmapId>)| {
         let mut bad = addition.clone();
         change(&mut bad);
         bad
     };
+    let more = |factor: Factor<SubmapId>| with(&|a| a.factors.push(factor));
     vec![
-        with(&|a| a.factors.push(Factor { j: stray, ..last })),
-        with(&|a| a.factors.push(Factor { j: last.i, ..last })),
-        with(&|a| a.factors.push(Factor { weight: f64::NAN, ..last })),
+        more(Factor { j: stray, ..last }),
+        more(Factor { j: last.i, ..last }),
+        more(Factor { weight: f64::NAN, ..last }),
         with(&|a| {
             a.nodes.insert(stray);
         }),
@@ -180,7 +182,7 @@ fn spoiled(addition: &Addition) -> Vec<Addition> {
             a.nodes.insert(submap(0, 0));
         }),
         with(&|a| a.factors[0].weight = f64::MAX),
-        with(&|a| a.factors.push(Factor { weight: f64::MAX, ..last })),
+        more(Factor { weight: f64::MAX, ..last }),
     ]
 }
 
@@ -190,10 +192,11 @@ fn refusals_say_why() {
     let mut grown = started(&mut growth, 6);
     let addition = growth.drive(0, 1, 0.0);
     let (id, last) = (submap(0, 6), addition.factors[0]);
-    let add = |grown: &mut Incremental, nodes: &[SubmapId], factors: &[Factor], unknown: &[FrameId]| {
-        let nodes = nodes.iter().copied().collect();
-        grown.add(Addition { nodes, unknown_scale: unknown.iter().copied().collect(), factors: factors.to_vec() })
-    };
+    let add =
+        |grown: &mut Incremental<SubmapId>, nodes: &[SubmapId], factors: &[Factor<SubmapId>], unknown: &[FrameId]| {
+            let nodes = nodes.iter().copied().collect();
+            grown.add(Addition { nodes, unknown_scale: unknown.iter().copied().collect(), factors: factors.to_vec() })
+        };
     let unknown_node = GraphError::UnknownNode { i: last.i, j: id };
     assert_eq!(add(&mut grown, &[], &[last], &[]), Err(IncrementalError::Graph(unknown_node)));
     assert_eq!(add(&mut grown, &[id], &[], &[]), Err(IncrementalError::Loose(id)));
@@ -219,7 +222,7 @@ fn a_metric_frame_cannot_join_where_another_gives_the_unit() {
 }
 
 /// Three robots with 300 anchors in one place.
-fn large(seed: u64) -> (Growth, Incremental) {
+fn large(seed: u64) -> (Growth, Incremental<SubmapId>) {
     let mut growth = Growth::new(seed, 3, false);
     for robot in 0..3 {
         growth.drive(robot, 100, 0.1);
@@ -295,11 +298,11 @@ fn covariances_are_those_of_a_batch_solve() {
 }
 
 /// Two anchors and one factor, solved; then a much surer factor says that the second is turned and moved by `delta`.
-fn pushed(delta: [f64; 6]) -> (Incremental, Update) {
+fn pushed(delta: [f64; 6]) -> (Incremental<SubmapId>, Update) {
     let (i, j) = (submap(0, 0), submap(0, 1));
     let factor = |pose: Se3, sigma: f64| {
         let t_i_j = Relative::Metric(PoseWithCovariance { pose, covariance: sigmas(sigma, sigma) });
-        Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 }
+        Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 }
     };
     let nodes = BTreeSet::from([i, j]);
     let graph = Graph::components(&nodes, &BTreeSet::new(), vec![factor(Se3::identity(), 0.1)]).unwrap().remove(0);

@@ -9,7 +9,7 @@ use super::solve::Start;
 use super::{Measurement, PoseGraph};
 use crate::Unused;
 use crate::graph::GraphError;
-use crate::solve::SolveError;
+use crate::solve::{ComponentError, SolveError};
 use core::fmt;
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
@@ -25,7 +25,7 @@ pub enum PoseGraphError {
     Solve(SolveError),
     /// Factors that are no graph.
     #[error(transparent)]
-    Graph(#[from] GraphError),
+    Graph(#[from] GraphError<u64>),
     /// The start wants a value that the file does not give.
     #[error("{} has no value; add its vertex or start from the relaxation", PoseName(*.0))]
     NoValue(u64),
@@ -115,26 +115,34 @@ impl PoseGraph {
     /// The solver's error in terms of this graph, which is one that it could not solve.
     pub(super) fn told(&self, error: SolveError) -> PoseGraphError {
         let fault = match error {
-            SolveError::Underconstrained { .. } | SolveError::UnderconstrainedAnchor(_) | SolveError::NotFinite
-                if self.parts().len() > 1 =>
-            {
+            SolveError::Underconstrained { .. } | SolveError::NotFinite if self.parts().len() > 1 => {
                 return PoseGraphError::Parts(self.parts().len());
             }
             // Variables are the poses in ascending order, without the first, which is held.
-            SolveError::Underconstrained { variable } => self.undetermined(variable + 1),
-            SolveError::UnderconstrainedAnchor(id) => self.undetermined(id.index as usize),
+            SolveError::Underconstrained { variable } => {
+                self.poses.keys().nth(variable + 1).and_then(|pose| self.undetermined(*pose))
+            }
             SolveError::NotFinite => self.overflow(),
-            SolveError::UnderconstrainedScale(_)
-            | SolveError::Start { .. }
-            | SolveError::TooDense { .. }
-            | SolveError::OutOfMemory => None,
+            SolveError::Start { .. } | SolveError::TooDense { .. } | SolveError::OutOfMemory => None,
         };
         fault.unwrap_or(PoseGraphError::Solve(error))
     }
 
-    /// The fault that leaves the pose at a place in ascending order free.
-    fn undetermined(&self, place: usize) -> Option<PoseGraphError> {
-        let pose = *self.poses.keys().nth(place)?;
+    /// The same of the minimum of χ².
+    pub(super) fn told_of_component(&self, error: ComponentError<u64>) -> PoseGraphError {
+        match error {
+            ComponentError::UnderconstrainedNode(pose) => {
+                let place = self.poses.range(..pose).count();
+                self.told(SolveError::Underconstrained { variable: place.saturating_sub(1) })
+            }
+            // No pose has a scale of its own.
+            ComponentError::UnderconstrainedScale(()) => self.told(SolveError::NotFinite),
+            ComponentError::Solve(error) => self.told(error),
+        }
+    }
+
+    /// The fault that leaves a pose free.
+    fn undetermined(&self, pose: u64) -> Option<PoseGraphError> {
         let most = self.measurements.iter().map(most).fold(0.0, f64::max);
         let least = |m: &Measurement| m.information.symmetric_eigenvalues().min();
         let weakest = |of: &dyn Fn(&Measurement) -> bool| {

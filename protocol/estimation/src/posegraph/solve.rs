@@ -4,10 +4,9 @@ use super::fault::{self, MeasurementFault, PoseGraphError};
 use super::{PoseGraph, covariance_of};
 use crate::certificate::Certificate;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
-use crate::graph::{Factor, Graph, Label};
-use crate::ids::{FrameId, RobotId, SubmapId};
+use crate::graph::{Factor, Graph};
 use crate::solve::{Solution, minimum, solve};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// Where a minimisation starts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,7 +53,7 @@ pub struct Solved {
     /// `t_world_pose`; the first pose is the identity, or as given.
     pub values: Vec<Se3>,
     /// The solution from which covariances are drawn.
-    pub solution: Solution,
+    pub solution: Solution<u64>,
 }
 
 impl PoseGraph {
@@ -96,7 +95,7 @@ impl PoseGraph {
     /// [`PoseGraphError`] if the graph is not connected or cannot be solved.
     pub fn minimise(&self, start: &[Se3], iterations_max: usize) -> Result<Minimised, PoseGraphError> {
         let start = start.iter().map(Sim3::from_se3).collect();
-        let found = minimum(&self.graph()?, start, iterations_max).map_err(|e| self.told(e))?;
+        let found = minimum(&self.graph()?, start, iterations_max).map_err(|e| self.told_of_component(e))?;
         let values = found.values.iter().map(Sim3::to_se3).collect();
         Ok(Minimised { values, chi2: found.chi2, iterations: found.iterations, converged: found.converged })
     }
@@ -107,14 +106,13 @@ impl PoseGraph {
     /// As [`PoseGraph::minimise`].
     pub fn solve(&self, start: &[Se3], iterations_max: usize) -> Result<Solved, PoseGraphError> {
         let start = start.iter().map(Sim3::from_se3).collect();
-        let solution = solve(self.graph()?, start, iterations_max).map_err(|e| self.told(e))?;
+        let solution = solve(self.graph()?, start, iterations_max).map_err(|e| self.told_of_component(e))?;
         let values = solution.values().iter().map(Sim3::to_se3).collect();
         Ok(Solved { ids: self.poses.keys().copied().collect(), values, solution })
     }
 
     /// The one component as the estimate's own graph.
-    fn graph(&self) -> Result<Graph, PoseGraphError> {
-        let place: BTreeMap<u64, SubmapId> = self.poses.keys().copied().zip((0..).map(node)).collect();
+    fn graph(&self) -> Result<Graph<u64>, PoseGraphError> {
         let factor = |m: &super::Measurement| {
             if !m.t_i_j.translation.iter().all(|x| x.is_finite()) {
                 return Err(fault::overflow(m));
@@ -122,10 +120,10 @@ impl PoseGraph {
             let what = MeasurementFault::Information;
             let covariance = covariance_of(&m.information).ok_or(PoseGraphError::At { line: m.line, what })?;
             let t_i_j = Relative::Metric(PoseWithCovariance { pose: m.t_i_j, covariance });
-            Ok(Factor { label: Label::Odometry, i: place[&m.i], j: place[&m.j], t_i_j, weight: 1.0 })
+            Ok(Factor { label: (), i: m.i, j: m.j, t_i_j, weight: 1.0 })
         };
         let factors = self.measurements.iter().map(factor).collect::<Result<_, PoseGraphError>>()?;
-        let nodes: BTreeSet<SubmapId> = place.values().copied().collect();
+        let nodes: BTreeSet<u64> = self.poses.keys().copied().collect();
         let mut graphs = Graph::components(&nodes, &BTreeSet::new(), factors)?;
         match (graphs.pop(), graphs.len()) {
             (Some(graph), 0) => Ok(graph),
@@ -143,14 +141,8 @@ impl Solved {
 
     /// The same relative to another pose, by its place among [`Solved::ids`].
     pub fn marginals_from(&self, origin: usize) -> Vec<(u64, Covariance<6>)> {
-        let Ok(origin) = u32::try_from(origin) else { return Vec::new() };
-        let relations = self.solution.relatives_to(node(origin), &BTreeSet::new());
-        let rigid = relations.into_iter().filter_map(|(id, t)| Some((id.index as usize, t.metric()?.covariance)));
-        rigid.filter_map(|(k, covariance)| Some((*self.ids.get(k)?, covariance))).collect()
+        let Some(&origin) = self.ids.get(origin) else { return Vec::new() };
+        let relations = self.solution.relatives_to(origin, &BTreeSet::new());
+        relations.into_iter().filter_map(|(id, t)| Some((id, t.metric()?.covariance))).collect()
     }
-}
-
-/// The estimate's name of the `k`-th pose.
-fn node(k: u32) -> SubmapId {
-    SubmapId { frame: FrameId { robot: RobotId([0; 8]), epoch: 0 }, index: k }
 }

@@ -106,7 +106,7 @@ pub(super) fn run(size: Size, seed: u64) -> anyhow::Result<(String, bool)> {
 }
 
 /// All factors of a run, drawn again: kept, they would count in the memory.
-fn driven_again(size: Size, seed: u64) -> Vec<Factor> {
+fn driven_again(size: Size, seed: u64) -> Vec<Factor<SubmapId>> {
     let mut swarm = Swarm::new(seed, size.robots, size.anchors);
     swarm.start();
     (0..ADDITIONS).for_each(|k| {
@@ -119,7 +119,7 @@ fn closes_loop(addition: usize) -> bool {
     (addition + 1).is_multiple_of(LOOP_EVERY)
 }
 
-fn batch(factors: Vec<Factor>, start: &BTreeMap<SubmapId, Sim3>) -> anyhow::Result<Solution> {
+fn batch(factors: Vec<Factor<SubmapId>>, start: &BTreeMap<SubmapId, Sim3>) -> anyhow::Result<Solution<SubmapId>> {
     let nodes = start.keys().copied().collect();
     let mut graphs = Graph::components(&nodes, &BTreeSet::new(), factors)?;
     anyhow::ensure!(graphs.len() == 1, "the swarm's graph falls into {} parts; take another seed", graphs.len());
@@ -155,7 +155,7 @@ fn describe(text: &mut String, additions: &[Cost], batch_s: f64) {
 }
 
 /// How far the grown estimate lies from a batch solve, relative to its first anchor: standard deviations, m.
-fn apart(batch: &Solution, grown: &Incremental) -> (f64, f64) {
+fn apart(batch: &Solution<SubmapId>, grown: &Incremental<SubmapId>) -> (f64, f64) {
     let first = submap(0, 0);
     let mut worst = (0.0_f64, 0.0_f64);
     let Some(origin) = grown.value(first).map(Sim3::inverse) else { return (f64::NAN, f64::NAN) };

@@ -2,7 +2,7 @@
 
 use crate::dice::Dice;
 use libm::{atan2, sqrt};
-use merganser_protocol::estimate::graph::{Factor, Label};
+use merganser_protocol::estimate::graph::{Factor, Source};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, So3};
 use merganser_protocol::ids::{FrameId, RobotId, SubmapId};
 use nalgebra::{Matrix6, Vector3, Vector6};
@@ -29,7 +29,7 @@ pub(super) struct Swarm {
     dice: Dice,
     robots: Vec<Robot>,
     /// Measured since this was last taken.
-    pub(super) new_factors: Vec<Factor>,
+    pub(super) new_factors: Vec<Factor<SubmapId>>,
 }
 
 struct Robot {
@@ -144,7 +144,7 @@ impl Swarm {
         let covariance = Covariance::new_or_wider(Matrix6::from_diagonal(&Vector6::new(p, p, p, r, r, r)));
         let t_i_j = Relative::Metric(PoseWithCovariance { pose, covariance });
         let (i, j) = (submap(i.0, i.1), submap(j.0, j.1));
-        self.new_factors.push(Factor { label: Label::Odometry, i, j, t_i_j, weight: 1.0 });
+        self.new_factors.push(Factor { label: Source::Odometry, i, j, t_i_j, weight: 1.0 });
         pose
     }
 }

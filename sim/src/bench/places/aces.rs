@@ -6,10 +6,10 @@ use super::sets::{Place, Set};
 use crate::bench::cpu::thread_seconds;
 use anyhow::{Context, ensure};
 use merganser_protocol::config::{Sensor, SubmapConfig};
-use merganser_protocol::estimate::graph::{Factor, Graph, Label};
+use merganser_protocol::estimate::graph::{Factor, Graph, Source};
 use merganser_protocol::estimate::solve::minimum;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, So3};
-use merganser_protocol::ids::{EntryId, FrameId, RobotId, SubmapId};
+use merganser_protocol::ids::{FrameId, RobotId, SubmapId};
 use merganser_protocol::submap::{Submap, SubmapBuilder, describe};
 use merganser_recording::carmen::{Parser, keyframes};
 use nalgebra::Vector3;
@@ -129,16 +129,16 @@ impl Way {
     fn truth(&self, relations: &str) -> anyhow::Result<Vec<Se3>> {
         let id = |index: usize| SubmapId { frame: FRAME, index: index as u32 };
         let odometry = (1..self.submaps.len()).map(|k| Factor {
-            label: Label::Odometry,
+            label: Source::Odometry,
             i: id(k - 1),
             j: id(k),
             t_i_j: Relative::Metric(self.submaps[k].submap.odometry),
             weight: 1.0,
         });
-        let mut factors: Vec<Factor> = odometry.collect();
+        let mut factors: Vec<Factor<SubmapId>> = odometry.collect();
         let (flat, (height, tilt)) = (RELATION, OUT_OF_PLANE);
         let covariance = Covariance::from_sigmas([flat.0, flat.0, height, tilt, tilt, flat.1])?;
-        for (seq, line) in (0..).zip(relations.lines()) {
+        for (place, line) in relations.lines().enumerate() {
             let (stamps, t_then_later) = relation(line)?;
             let [Some((i, t_i_then)), Some((j, t_j_later))] = stamps.map(|stamp| self.at(stamp)) else { continue };
             if i == j {
@@ -146,7 +146,7 @@ impl Way {
             }
             let pose = t_i_then * t_then_later * t_j_later.inverse();
             let (i, j) = (id(i), id(j));
-            let label = Label::Sighting(EntryId { frame: FRAME, seq });
+            let label = Source::Measurement(place);
             let t_i_j = Relative::Metric(PoseWithCovariance { pose, covariance });
             factors.push(Factor { label, i, j, t_i_j, weight: 1.0 });
         }

@@ -28,7 +28,7 @@ use crate::Unused;
 use crate::config::EstimateConfig;
 use crate::frames::scales_to;
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
-use crate::graph::{Factor, Label};
+use crate::graph::{Factor, Source};
 use crate::ids::{FrameId, SubmapId};
 use crate::kinds::PairStatus;
 use crate::solve::Solution;
@@ -73,7 +73,7 @@ pub struct RobustSolved {
     /// By how much standard deviations differ from the stated ones, as all that counts shows (root of the mean variance
     /// over the six directions): decisions were made with these.
     pub sigma_scale: f64,
-    solutions: Vec<Solution>,
+    solutions: Vec<Solution<SubmapId>>,
 }
 
 impl RobustSolved {
@@ -252,7 +252,7 @@ impl PoseGraph {
             let m = &self.measurements[k];
             let (i, j) = (backbone.anchors[&m.i], backbone.anchors[&m.j]);
             if let Some(t) = measured(m, noise) {
-                let factor = Factor { label: Label::Odometry, i, j, t_i_j: Relative::Metric(t), weight: 1.0 };
+                let factor = Factor { label: Source::Odometry, i, j, t_i_j: Relative::Metric(t), weight: 1.0 };
                 world.trusted.entry(i.frame).or_default().push(factor);
             }
         }

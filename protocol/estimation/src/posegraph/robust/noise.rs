@@ -7,7 +7,7 @@
 //! solved with the information that the graph states.
 
 use crate::geometry::{Covariance, Relative, se3};
-use crate::graph::Edge;
+use crate::graph::{Edge, Key};
 use crate::solve::Solution;
 use nalgebra::{Matrix6, Vector6};
 
@@ -61,7 +61,7 @@ pub(super) struct Tally {
 
 impl Tally {
     /// Adds all measurements of a solved component.
-    pub(super) fn add(&mut self, solution: &Solution) {
+    pub(super) fn add<K: Key>(&mut self, solution: &Solution<K>) {
         let inverse = solution.selected_inverse();
         for edge in solution.graph().edges() {
             let predicted = solution.covariance_along(&inverse, edge.i, edge.j);
@@ -88,7 +88,11 @@ impl Tally {
 }
 
 /// Squares of the whitened residual, and the share of each direction's variance that the rest predicts.
-fn whitened(solution: &Solution, edge: &Edge, predicted: &Matrix6<f64>) -> Option<(Vector6<f64>, Vector6<f64>)> {
+fn whitened<K: Key>(
+    solution: &Solution<K>,
+    edge: &Edge<K>,
+    predicted: &Matrix6<f64>,
+) -> Option<(Vector6<f64>, Vector6<f64>)> {
     let Relative::Metric(p) = edge.t_i_j() else { return None };
     let residual = edge.residual(solution.values()).fixed_rows::<6>(0).into_owned();
     let l = p.covariance.matrix().cholesky()?.l();

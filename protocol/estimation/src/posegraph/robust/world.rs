@@ -10,10 +10,10 @@ use super::scale::{self, Innovation, Scale};
 use crate::Unused;
 use crate::config::EstimateConfig;
 use crate::geometry::{Relative, Se3, Sim3, chi2};
-use crate::graph::{Disjoint, Factor, Graph, Label};
-use crate::ids::{EntryId, FrameId, SubmapId};
+use crate::graph::{Disjoint, Factor, Graph, Source};
+use crate::ids::{FrameId, SubmapId};
 use crate::reweight::leave_one_out;
-use crate::solve::{Solution, SolveError, solve};
+use crate::solve::{ComponentError, Solution, SolveError, solve};
 use core::f64::consts::PI;
 use nalgebra::{Matrix6, Vector3};
 use std::collections::{BTreeMap, BTreeSet};
@@ -45,7 +45,7 @@ pub(super) struct Part {
     pub(super) frames: BTreeSet<FrameId>,
     /// Closures that it counts.
     used: Vec<usize>,
-    pub(super) solution: Solution,
+    pub(super) solution: Solution<SubmapId>,
     /// Covariance of each anchor's perturbation, the first held fixed.
     marginals: Vec<Matrix6<f64>>,
     /// Volume, of places times rotations, over which a false closure may fall.
@@ -57,7 +57,7 @@ pub(super) struct Part {
 pub(super) struct World<'a> {
     pub(super) config: &'a EstimateConfig,
     /// Trusted factors by frame.
-    pub(super) trusted: BTreeMap<FrameId, Vec<Factor>>,
+    pub(super) trusted: BTreeMap<FrameId, Vec<Factor<SubmapId>>>,
     pub(super) nodes: BTreeMap<FrameId, BTreeSet<SubmapId>>,
     pub(super) closures: Vec<Closure>,
     pub(super) start: BTreeMap<SubmapId, Sim3>,
@@ -98,7 +98,7 @@ impl World<'_> {
                     self.start.extend(nodes.zip(part.solution.values().iter().copied()));
                     self.parts.push(part);
                 }
-                Err(error) => used.iter().for_each(|&k| self.closures[k].refuse_for_good(Unused::Failed(error))),
+                Err(error) => used.iter().for_each(|&k| self.closures[k].refuse_for_good(Unused::Failed(error.into()))),
             }
         }
     }
@@ -122,12 +122,12 @@ impl World<'_> {
         groups.into_values().collect()
     }
 
-    fn solved(&self, frames: BTreeSet<FrameId>, used: Vec<usize>) -> Result<Part, SolveError> {
+    fn solved(&self, frames: BTreeSet<FrameId>, used: Vec<usize>) -> Result<Part, ComponentError<SubmapId>> {
         let nodes: BTreeSet<SubmapId> = frames.iter().flat_map(|f| self.nodes[f].iter().copied()).collect();
         let trusted = frames.iter().flat_map(|f| self.trusted.get(f).into_iter().flatten().copied());
         let factors = trusted.chain(used.iter().map(|&k| self.closures[k].factor())).collect();
         let mut graphs = Graph::components(&nodes, &BTreeSet::new(), factors).map_err(|_| SolveError::NotFinite)?;
-        let (Some(graph), 0) = (graphs.pop(), graphs.len()) else { return Err(SolveError::NotFinite) };
+        let (Some(graph), 0) = (graphs.pop(), graphs.len()) else { return Err(SolveError::NotFinite.into()) };
         let start = graph.nodes().iter().map(|id| self.start.get(id).copied().unwrap_or_else(Sim3::identity)).collect();
         let solution = solve(graph, start, self.config.iterations_max)?;
         let inverse = solution.selected_inverse();
@@ -144,7 +144,7 @@ impl World<'_> {
             let inverse = part.solution.selected_inverse();
             let nodes = part.solution.graph().nodes();
             for edge in part.solution.graph().edges() {
-                let Label::Alignment(entry) = edge.label else { continue };
+                let Source::Measurement(measurement) = edge.label else { continue };
                 let Some(out) = leave_one_out(&part.solution, &inverse, edge) else { continue };
                 let Some(limit) = out.dof.checked_sub(1).and_then(|k| CHI2_MAX.get(k)) else { continue };
                 let (i, j) = (nodes[edge.i].frame, nodes[edge.j].frame);
@@ -153,7 +153,7 @@ impl World<'_> {
                 let excess = out.chi2 / if asked { self.limit(part, out.log_sqrt_det) } else { *limit };
                 let place = worst.entry((i.min(j), i.max(j))).or_insert((1.0, usize::MAX, 0.0));
                 if excess > place.0 {
-                    *place = (excess, entry.seq as usize, out.chi2);
+                    *place = (excess, measurement, out.chi2);
                 }
             }
         }
@@ -297,7 +297,7 @@ impl World<'_> {
         for part in &self.parts {
             volume = f64::max(volume, part.volume);
             let inverse = part.solution.selected_inverse();
-            for edge in part.solution.graph().edges().iter().filter(|e| e.label != Label::Odometry) {
+            for edge in part.solution.graph().edges().iter().filter(|e| e.label != Source::Odometry) {
                 let judged = leave_one_out(&part.solution, &inverse, edge).filter(|out| out.dof == 6);
                 innovations.extend(judged.map(|out| (out.chi2, out.log_sqrt_det)));
             }
@@ -407,8 +407,8 @@ impl Closure {
         self.unused = Some(reason);
     }
 
-    fn factor(&self) -> Factor {
-        let label = Label::Alignment(EntryId { frame: self.i.frame.max(self.j.frame), seq: self.k as u32 });
+    fn factor(&self) -> Factor<SubmapId> {
+        let label = Source::Measurement(self.k);
         Factor { label, i: self.i, j: self.j, t_i_j: Relative::Metric(self.t_i_j), weight: 1.0 }
     }
 }
