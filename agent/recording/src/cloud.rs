@@ -2,32 +2,14 @@
 //! metres in the body frame; every point must be finite, and no claim in a header makes us allocate more than the file
 //! itself can hold.
 
-use super::error::{Problem, RecordingError, on};
+pub use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX};
+
+use super::bounded::{Fault, bounded, read_bytes};
+use super::error::{Problem, RecordingError};
 use super::{pcd, ply};
 use crate::manifest::{CloudFormat, XYZ_I16_UNIT_M};
 use crate::observation::COORDINATE_MAX;
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
-
-/// Points read from one cloud at most: eight times a full turn of a 64-line LiDAR.
-pub const POINTS_MAX: usize = 1_000_000;
-/// Bytes read from one cloud at most: [`POINTS_MAX`] points of 128 bytes.
-pub const CLOUD_BYTES_MAX: u64 = 128_000_000;
-
-/// A problem in a cloud, with the line where its format has lines.
-pub(super) struct Fault {
-    /// Counted from 1.
-    pub line: Option<usize>,
-    /// What is wrong.
-    pub problem: Problem,
-}
-
-impl From<Problem> for Fault {
-    fn from(problem: Problem) -> Self {
-        Self { line: None, problem }
-    }
-}
 
 /// Reads a cloud.
 ///
@@ -40,23 +22,6 @@ pub fn read(path: &Path, format: CloudFormat) -> Result<Vec<[f32; 3]>, Recording
         line: fault.line,
         problem: fault.problem,
     })
-}
-
-/// The whole file, if it is not larger than [`CLOUD_BYTES_MAX`].
-pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
-    let file = on(path, File::open(path))?;
-    let length = on(path, file.metadata())?.len();
-    if length > CLOUD_BYTES_MAX {
-        return Err(Problem::CloudBytes(length).of(path));
-    }
-    let mut bytes = Vec::new();
-    on(path, file.take(CLOUD_BYTES_MAX).read_to_end(&mut bytes))?;
-    Ok(bytes)
-}
-
-/// The whole file as text, if it is not larger than [`CLOUD_BYTES_MAX`].
-pub(super) fn read_text(path: &Path) -> Result<String, RecordingError> {
-    String::from_utf8(read_bytes(path)?).map_err(|_| Problem::Data("is no text".into()).of(path))
 }
 
 fn parse(bytes: &[u8], format: CloudFormat) -> Result<Vec<[f32; 3]>, Fault> {
@@ -74,14 +39,6 @@ fn parse(bytes: &[u8], format: CloudFormat) -> Result<Vec<[f32; 3]>, Fault> {
     match points.iter().position(|point| !point.iter().all(near)) {
         Some(index) => Err(Problem::Point(index).into()),
         None => Ok(points),
-    }
-}
-
-/// Refuses a claimed number of points that is too large.
-pub(super) fn bounded(points: u64) -> Result<usize, Problem> {
-    match usize::try_from(points) {
-        Ok(count) if count <= POINTS_MAX => Ok(count),
-        _ => Err(Problem::CloudPoints(points)),
     }
 }
 

@@ -1,7 +1,7 @@
 //! What can be wrong with a recording: one [`Problem`] per bad case, always told with the file and, where it is text,
 //! the line.
 
-use super::cloud::{CLOUD_BYTES_MAX, POINTS_MAX};
+use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX};
 use crate::manifest::{FORMAT, KEYFRAMES_MAX, VERSION};
 use crate::observation::COORDINATE_MAX;
 use merganser_protocol::config::ConfigError;

@@ -4,9 +4,9 @@
 //! another robot drives, too.
 
 use super::Writer;
-use super::cloud::read_bytes;
+use super::bounded::read_bytes;
+use super::cut::NAMES;
 use super::error::{Problem, RecordingError, on};
-use super::import::NAMES;
 use crate::carmen::{Log, Parser, Scan, keyframes};
 use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
 use core::ops::Range;

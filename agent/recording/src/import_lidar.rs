@@ -3,9 +3,10 @@
 //! the LiDAR's frame: twelve numbers a line, the line being the scan's number, or `index x y z qx qy qz qw`).
 
 use super::Drift;
+use super::bounded::read_text;
 use super::cloud;
+use super::cut::{Cut, Scan};
 use super::error::{Problem, RecordingError, on};
-use super::import::{Cut, Scan};
 use super::import_rgbd::rigid;
 use super::table::{number, pose_of};
 use crate::manifest::CloudFormat;
@@ -89,7 +90,7 @@ fn numbered(data: &Path, format: CloudFormat) -> Result<Vec<u32>, RecordingError
 
 /// `t_world_lidar` by the scan's number.
 fn read_poses(path: &Path) -> Result<BTreeMap<u32, Se3>, RecordingError> {
-    let text = cloud::read_text(path)?;
+    let text = read_text(path)?;
     let mut poses = BTreeMap::new();
     for (index, line) in text.lines().enumerate() {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();

@@ -3,7 +3,7 @@
 //! handed over under their bar codes, and where other robots were seen.
 
 use super::Writer;
-use super::cloud::read_bytes;
+use super::bounded::read_bytes;
 use super::error::{Problem, RecordingError, on};
 use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
 use crate::mrclam::{MrclamError, keyframes, position, sightings, speeds, subjects};

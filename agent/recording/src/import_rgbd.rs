@@ -3,9 +3,9 @@
 //! camera: x right, y down, z forward. Depth from 0.3 to 4 m, every sixth pixel of every sixth row: up to 8,500 points.
 
 use super::Drift;
-use super::cloud::{read_bytes, read_text};
+use super::bounded::{read_bytes, read_text};
+use super::cut::{Cut, Scan};
 use super::error::{Problem, RecordingError, on};
-use super::import::{Cut, Scan};
 use super::table::{near, number};
 use crate::depth::{Camera, Counts, DepthError, DepthImage};
 use merganser_protocol::config::Config;

@@ -2,7 +2,7 @@
 //! covariance of the place, body frame, m²), and may have `label` (any integer type; negative for none) and `d0` to
 //! `d31` (uchar: 256 bits; all zero for none).
 
-use super::cloud::{Fault, read_bytes};
+use super::bounded::{Fault, read_bytes};
 use super::error::{Problem, RecordingError};
 use super::ply;
 use crate::manifest::CloudFormat;

@@ -4,8 +4,10 @@
 //! [`Recording::open`] reads the manifest and both tables and looks for every cloud; the clouds themselves are read one
 //! by one, by [`Recording::keyframe`]. A bad recording is refused with one error that names file and line.
 
+mod bounded;
 pub mod carmen;
 pub mod cloud;
+mod cut;
 pub mod depth;
 mod drift;
 mod error;
@@ -15,6 +17,7 @@ mod import_lidar;
 mod import_mrclam;
 mod import_rgbd;
 mod landmarks;
+mod limits;
 mod line_error;
 pub mod manifest;
 pub mod mrclam;

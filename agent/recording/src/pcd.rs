@@ -2,7 +2,7 @@
 //! it allocates what a header asks for. An organised cloud (of more than one row) keeps its sensor's grid, with NaN or
 //! infinity where nothing was measured: such points are left out. In any other they are a mistake.
 
-use super::cloud::bounded;
+use super::bounded::bounded;
 use super::error::Problem;
 use pcd_rs::{DataKind, DynReader, Field, PcdMeta};
 use std::io::Cursor;
@@ -89,7 +89,7 @@ fn told(error: pcd_rs::Error) -> Problem {
 
 #[cfg(test)]
 mod tests {
-    use super::super::cloud::POINTS_MAX;
+    use super::super::limits::POINTS_MAX;
     use super::*;
     use pcd_rs::{DynRecord, Schema, ValueKind, WriterInit};
 

@@ -1,7 +1,7 @@
 //! PLY clouds: ASCII and binary little-endian, the `vertex` element's x, y, z. A small strict reader of our own, since
 //! no maintained library reads PLY; the other properties and later elements are skipped.
 
-use super::cloud::{Fault, bounded};
+use super::bounded::{Fault, bounded};
 use super::error::Problem;
 use std::ops::Range;
 
@@ -266,7 +266,7 @@ fn head(count: usize, more: &str) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::cloud::POINTS_MAX;
+    use super::super::limits::POINTS_MAX;
     use super::*;
 
     const ASCII: &str = "ply\nformat ascii 1.0\ncomment c\nelement vertex 2\nproperty uchar red\nproperty double x\n\

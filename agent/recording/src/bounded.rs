@@ -1,0 +1,46 @@
+//! Files and what they claim are looked at before memory is taken for them.
+
+use super::error::{Problem, RecordingError, on};
+use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// A problem in a cloud, with the line where its format has lines.
+pub(super) struct Fault {
+    /// Counted from 1.
+    pub line: Option<usize>,
+    /// What is wrong.
+    pub problem: Problem,
+}
+
+impl From<Problem> for Fault {
+    fn from(problem: Problem) -> Self {
+        Self { line: None, problem }
+    }
+}
+
+/// The whole file, if it is not larger than [`CLOUD_BYTES_MAX`].
+pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
+    let file = on(path, File::open(path))?;
+    let length = on(path, file.metadata())?.len();
+    if length > CLOUD_BYTES_MAX {
+        return Err(Problem::CloudBytes(length).of(path));
+    }
+    let mut bytes = Vec::new();
+    on(path, file.take(CLOUD_BYTES_MAX).read_to_end(&mut bytes))?;
+    Ok(bytes)
+}
+
+/// The whole file as text, if it is not larger than [`CLOUD_BYTES_MAX`].
+pub(super) fn read_text(path: &Path) -> Result<String, RecordingError> {
+    String::from_utf8(read_bytes(path)?).map_err(|_| Problem::Data("is no text".into()).of(path))
+}
+
+/// Refuses a claimed number of points that is too large.
+pub(super) fn bounded(points: u64) -> Result<usize, Problem> {
+    match usize::try_from(points) {
+        Ok(count) if count <= POINTS_MAX => Ok(count),
+        _ => Err(Problem::CloudPoints(points)),
+    }
+}

@@ -1,0 +1,6 @@
+//! How large a cloud may be.
+
+/// Points read from one cloud at most: eight times a full turn of a 64-line LiDAR.
+pub const POINTS_MAX: usize = 1_000_000;
+/// Bytes read from one cloud at most: [`POINTS_MAX`] points of 128 bytes.
+pub const CLOUD_BYTES_MAX: u64 = 128_000_000;
