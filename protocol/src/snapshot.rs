@@ -4,10 +4,14 @@
 //! Poses are `{translation: [x, y, z], rotation: [x, y, z, w], scale}`; covariances are the row-major upper triangle of
 //! the local perturbation's covariance in the order (ρ, φ[, λ]): 21 numbers for a rigid pose, 28 for a similarity.
 
-use crate::geometry::{Relative, Se3, Sim3};
+use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
 pub use crate::kinds::{Optimality, PairStatus};
+use nalgebra::SMatrix;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+
+/// What must be one may differ from it by this: numbers travel as text.
+const UNIT_SLACK: f64 = 1e-6;
 
 /// All views at one moment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -131,6 +135,21 @@ pub struct PairView {
     pub log10_nfa: Option<f64>,
     /// `t_a_b` of the joint estimate if merged, of the frame-level consensus otherwise.
     pub t_a_b: Option<RelationView>,
+    /// Of a merged pair, how two anchors in the middle of what both saw lie: what a merge is worth shows there. The
+    /// origins of the frames may be far away, and `t_a_b` as uncertain as the way to them.
+    #[serde(default)]
+    pub middle: Option<MiddleView>,
+}
+
+/// How two anchors lie by the joint estimate.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MiddleView {
+    /// Anchor of the first frame, `name/epoch#index`.
+    pub i: String,
+    /// Anchor of the second frame.
+    pub j: String,
+    /// `t_i_j`.
+    pub t_i_j: RelationView,
 }
 
 /// `view/poses`.
@@ -302,8 +321,50 @@ impl From<&Relative> for RelationView {
 }
 
 impl RelationView {
-    fn of<const N: usize>(pose: PoseView, p: &nalgebra::SMatrix<f64, N, N>) -> Self {
+    fn of<const N: usize>(pose: PoseView, p: &SMatrix<f64, N, N>) -> Self {
         let covariance = (0..N).flat_map(|r| (r..N).map(move |c| p[(r, c)])).collect();
         Self { pose, covariance, sigmas: (0..N).map(|i| p[(i, i)].sqrt()).collect() }
     }
+}
+
+/// A pose without its scale; `None` if a number is not finite or the quaternion is not of length one.
+pub fn pose(view: &PoseView) -> Option<Se3> {
+    let length = view.rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
+    Se3::from_xyzw(view.rotation, view.translation).filter(|_| (length - 1.0).abs() <= UNIT_SLACK)
+}
+
+/// A rigid pose with its covariance; `None` for a similarity.
+pub fn relation(view: &RelationView) -> Option<PoseWithCovariance> {
+    match relative(view)? {
+        Relative::Metric(t) => Some(t),
+        Relative::Similarity(_) => None,
+    }
+}
+
+/// A relation with its covariance: a similarity where the covariance is one of seven values. `None` if it is neither: a
+/// pose that is none, a scale that is none or, of a rigid one, not 1, or a covariance that is not positive definite.
+pub fn relative(view: &RelationView) -> Option<Relative> {
+    let (pose, scale) = (pose(&view.pose)?, view.pose.scale);
+    match view.covariance.len() {
+        21 if (scale - 1.0).abs() <= UNIT_SLACK => {
+            let covariance = Covariance::new(square::<6>(&view.covariance)).ok()?;
+            Some(Relative::Metric(PoseWithCovariance { pose, covariance }))
+        }
+        28 if scale.is_finite() && scale > 0.0 => {
+            let covariance = Covariance::new(square::<7>(&view.covariance)).ok()?;
+            let sim = Sim3::new(pose.rotation, pose.translation, scale);
+            Some(Relative::Similarity(SimWithCovariance { sim, covariance }))
+        }
+        _ => None,
+    }
+}
+
+/// The symmetric matrix of a row-major upper triangle.
+fn square<const N: usize>(triangle: &[f64]) -> SMatrix<f64, N, N> {
+    let mut m = SMatrix::zeros();
+    for ((row, column), value) in (0..N).flat_map(|r| (r..N).map(move |c| (r, c))).zip(triangle) {
+        m[(row, column)] = *value;
+        m[(column, row)] = *value;
+    }
+    m
 }

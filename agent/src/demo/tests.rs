@@ -75,6 +75,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
         used: 7,
         log10_nfa: Some(-20.0),
         t_a_b: Some(relation(t_a_b(a, b))),
+        middle: None,
     };
     let submap = |robot: usize, index: usize| {
         let (first, last) = (index * PER_SUBMAP, (index + 1) * PER_SUBMAP - 1);

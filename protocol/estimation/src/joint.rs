@@ -184,8 +184,22 @@ pub struct PairEstimate {
     /// `t_a_b` between the frames' origins: the joint estimate if their component holds both, the pair's own consensus
     /// otherwise.
     pub t_a_b: Option<Relative>,
+    /// Of a merged pair: how the two lie in the middle of what both saw. The origins of the frames may be far from it, and
+    /// [`PairEstimate::t_a_b`] as uncertain as the way there.
+    pub middle: Option<Middle>,
     /// The pair agrees with itself but contradicts a loop of stronger pairs, so it was left out.
     pub contradicts_loop: bool,
+}
+
+/// How two anchors of different frames lie by the joint estimate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Middle {
+    /// In the first frame of the pair.
+    pub i: SubmapId,
+    /// In the second.
+    pub j: SubmapId,
+    /// `t_i_j`, cross-correlations included.
+    pub t_i_j: Relative,
 }
 
 /// Frames that are connected, solved together.

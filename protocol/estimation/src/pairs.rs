@@ -8,7 +8,7 @@
 use super::admission::{Admission, Chain};
 use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
 use super::graph::is_rigid;
-use super::joint::{EdgeEstimate, JointEstimate, PairEstimate, Unused};
+use super::joint::{AgreedAlignment, EdgeEstimate, JointEstimate, Middle, PairEstimate, Unused};
 use super::loops::{self, Loops};
 use crate::config::EstimateConfig;
 use crate::geometry::{Disagreement, Relative, Sim3, chi2};
@@ -188,8 +188,25 @@ impl Pair {
             used: used(&self.members, map.edges()) + used(&self.second_looks, map.edges()),
             log10_nfa: self.outcome.log10_nfa,
             t_a_b: map.frame(self.a, self.b).or(self.outcome.t_a_b),
+            middle: self.middle(map),
             contradicts_loop: self.contradicts_loop,
         }
+    }
+}
+
+impl Pair {
+    /// The relation of the anchors of the alignment that is used and lies in the middle of those used, along the first
+    /// frame's way.
+    fn middle(&self, map: &JointEstimate) -> Option<Middle> {
+        let edges = self.members.iter().chain(&self.second_looks).map(|&k| &map.edges()[k]);
+        let turned = |e: &EdgeEstimate| match e.measurement {
+            AgreedAlignment { i, j, .. } if i.frame == self.a => (i, j),
+            AgreedAlignment { i, j, .. } => (j, i),
+        };
+        let mut ends: Vec<(SubmapId, SubmapId)> = edges.filter(|e| e.is_used()).map(turned).collect();
+        ends.sort_unstable();
+        let (i, j) = *ends.get(ends.len() / 2)?;
+        Some(Middle { i, j, t_i_j: map.relative(i, j)? })
     }
 }
 

@@ -140,6 +140,9 @@ impl Solved {
                     *node = Node::Anchor(index(node.submap()));
                 }
             }
+            for middle in self.pairs.iter_mut().filter_map(|pair| pair.middle.as_mut()) {
+                (middle.i, middle.j) = (index(middle.i), index(middle.j));
+            }
             for (_, why) in &mut self.failed {
                 if let Shortfall::Unsolved(ComponentError::UnderconstrainedNode(node)) = why {
                     *node = Node::Anchor(index(node.submap()));

@@ -11,8 +11,8 @@ use crate::estimate::solve::ComponentError;
 use crate::geometry::Se3;
 use crate::ids::{EntryId, FrameId, RobotId};
 use crate::snapshot::{
-    CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, PairView, PoseView, PosesView,
-    RelationView, Snapshot, StatsView, StatusView, SubmapView,
+    CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, MiddleView, PairView, PoseView,
+    PosesView, RelationView, Snapshot, StatsView, StatusView, SubmapView,
 };
 use crate::time::Instant;
 use crate::wire::fact::AlignmentFact;
@@ -135,6 +135,11 @@ impl Agent {
                 used: pair.used as u64,
                 log10_nfa: pair.log10_nfa,
                 t_a_b: pair.t_a_b.as_ref().map(RelationView::from),
+                middle: pair.middle.as_ref().map(|middle| MiddleView {
+                    i: self.context.submap_name(middle.i),
+                    j: self.context.submap_name(middle.j),
+                    t_i_j: RelationView::from(&middle.t_i_j),
+                }),
             })
             .collect()
     }
