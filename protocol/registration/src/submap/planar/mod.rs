@@ -16,6 +16,7 @@
 
 mod codec;
 mod describe;
+mod elsewhere;
 mod fit;
 mod lines;
 mod motion;

@@ -1,8 +1,11 @@
 //! Wheels slip and skid; the laser sees by how much. Each keyframe's scan is fitted to the walls of the keyframes
 //! before it, with the odometry as a prior: the maximum a posteriori of both. Along a bare corridor the odometry stays
-//! as it is, and the covariance says so.
+//! as it is, and the covariance says so. Wheels may also be wrong by far more than they say (`elsewhere`): where a scan
+//! fits so much better at another place that this is the likelier, the motion is that to there.
 
+use super::super::near::Near;
 use super::OUT_OF_PLANE_DRIVEN;
+use super::elsewhere::{self, Odometry};
 use super::fit::{Walls, system};
 use super::lines::lines;
 use super::se2::{Se2, in_plane, in_space};
@@ -21,7 +24,7 @@ const ITERATIONS_MAX: usize = 25;
 /// A step below this (voxels, and rad at 30 voxels) is small.
 const STEP: f64 = 0.01;
 /// Cosine of the largest angle between a beam and what it hits.
-const FACING: f64 = 0.1;
+pub(super) const FACING: f64 = 0.1;
 /// Pairs without which the odometry stays as it is.
 const PAIRS_MIN: usize = 20;
 /// Independent measurements that the pairs of one scan amount to: they lie on a few walls, and the walls were
@@ -31,7 +34,7 @@ const INDEPENDENT_MAX: f64 = 20.0;
 const FLOOR: f64 = 0.1;
 /// ...and rad.
 const FLOOR_RAD: f64 = 0.003;
-/// A fit that contradicts the odometry by more (χ²₃, 1e-5) is none.
+/// A fit that contradicts the odometry by more (χ²₃, 1e-5) is weighed against the odometry itself.
 const CHI2_MAX: f64 = 25.9;
 
 /// Corrects motions, keyframe by keyframe.
@@ -91,40 +94,71 @@ impl Sharpener {
         prior: &Matrix3<f64>,
         scan: &[Vector2<f64>],
     ) -> Option<(Se2, Matrix3<f64>)> {
-        let near = self.walls(last).near();
+        let walls = self.walls(last);
+        let near = walls.near();
         // A single scan's far points lie too sparse for lines of their own: all that is known is that they face the
         // sensor.
         let normals = scan.iter().map(|p| (-p).try_normalize(1e-9).unwrap_or_else(Vector2::x)).collect();
-        let walls = Walls { points: scan.to_vec(), normals };
-        let information = prior.try_inverse()?;
-        let mut pose = *odometry;
-        for iteration in 0..ITERATIONS_MAX {
-            let settled = iteration + 1 >= RADII.len();
-            let system = system(&walls, &near, &pose, RADII[iteration.min(RADII.len() - 1)], FACING);
-            if system.pairs < PAIRS_MIN {
-                return None;
-            }
-            let weight = (INDEPENDENT_MAX / system.pairs as f64).min(1.0) / (system.sigma * system.sigma);
-            let off = odometry.local(&pose);
-            let total = system.h * weight + information;
-            let step = -total.cholesky()?.solve(&(system.g * weight + information * off));
-            pose = pose.retract(&step);
-            if settled && step.xy().norm() + 30.0 * step.z.abs() < STEP {
-                break;
-            }
+        let seen = Walls { points: scan.to_vec(), normals };
+        let told = Odometry { motion: *odometry, information: prior.try_inverse()? };
+        let settled = settled(&seen, &near, &told)?;
+        let mut poses = vec![settled];
+        poses.extend(elsewhere::candidates(&seen, &walls, &near, &told, &settled));
+        if told.distance_squared(&settled) > CHI2_MAX {
+            poses.push(*odometry);
         }
-        let off = odometry.local(&pose);
-        if off.dot(&(information * off)) > CHI2_MAX {
-            return None;
-        }
-        let system = system(&walls, &near, &pose, RADII[RADII.len() - 1], FACING);
+        let (pose, doubt) = weighed(&poses, scan, &near, &told);
+        let system = system(&seen, &near, &pose, RADII[RADII.len() - 1], FACING);
         let weight = (INDEPENDENT_MAX / system.pairs.max(1) as f64).min(1.0) / (system.sigma * system.sigma);
-        let mut covariance = (system.h * weight + information).try_inverse()?;
+        let information = if told.is_slip(&pose) { told.reach() } else { told.information };
+        let mut covariance = (system.h * weight + information).try_inverse()? + doubt;
         for (k, floor) in [FLOOR, FLOOR, FLOOR_RAD].into_iter().enumerate() {
             covariance[(k, k)] += floor * floor;
         }
         Some((pose, covariance))
     }
+}
+
+/// The maximum a posteriori of a scan's fit to the walls and the odometry, from where the odometry has it.
+fn settled(scan: &Walls, near: &Near, told: &Odometry) -> Option<Se2> {
+    let mut pose = told.motion;
+    for iteration in 0..ITERATIONS_MAX {
+        let is_last_radius = iteration + 1 >= RADII.len();
+        let system = system(scan, near, &pose, RADII[iteration.min(RADII.len() - 1)], FACING);
+        if system.pairs < PAIRS_MIN {
+            return None;
+        }
+        let weight = (INDEPENDENT_MAX / system.pairs as f64).min(1.0) / (system.sigma * system.sigma);
+        let off = told.motion.local(&pose);
+        let total = system.h * weight + told.information;
+        let step = -total.cholesky()?.solve(&(system.g * weight + told.information * off));
+        pose = pose.retract(&step);
+        if is_last_radius && step.xy().norm() + 30.0 * step.z.abs() < STEP {
+            break;
+        }
+    }
+    Some(pose)
+}
+
+/// The most likely of several motions, by the scan and the odometry, and what the covariance grows by where others are
+/// about as likely. Only the first is taken if there is no other.
+fn weighed(poses: &[Se2], scan: &[Vector2<f64>], near: &Near, told: &Odometry) -> (Se2, Matrix3<f64>) {
+    if let [only] = poses {
+        return (*only, Matrix3::zeros());
+    }
+    let of = |pose: &Se2| INDEPENDENT_MAX * elsewhere::log_likelihood(scan, near, pose) + told.log_likelihood(pose);
+    let scores: Vec<f64> = poses.iter().map(of).collect();
+    // The first of equals.
+    let best = (0..poses.len()).fold(0, |best, k| if scores[k] > scores[best] { k } else { best });
+    let others = (0..poses.len()).filter(|k| elsewhere::differ(&poses[*k], &poses[best]));
+    let (mut spread, mut sum) = (Matrix3::zeros(), 1.0);
+    for k in others {
+        let share = libm::exp(scores[k] - scores[best]);
+        let off = poses[best].local(&poses[k]);
+        spread += off * off.transpose() * share;
+        sum += share;
+    }
+    (poses[best], spread / sum)
 }
 
 /// In the plane and in voxels.

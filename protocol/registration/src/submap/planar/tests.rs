@@ -172,6 +172,30 @@ fn scans_sharpen_motion_where_they_can_and_say_so_where_not() {
     assert!(unsure > 2.0 * sure, "{unsure} {sure}");
 }
 
+/// Wheels that count a way back as a way ahead, or spin on the spot, and claim to be good to 5 cm: where walls tell, the
+/// scans put it right; a claim that walls bear out stays as it is.
+#[test]
+fn scans_mend_wheels_that_are_wrong_by_far_more_than_they_say() {
+    let driven = |ways: &[(f64, f64)]| {
+        let start = Se2::new(0.1, Vector2::new(1.0, 1.0));
+        let mut builder = SubmapBuilder::new(config());
+        let (mut at, mut told) = (0.0, 0.0);
+        for (k, (true_step, told_step)) in core::iter::once(&(0.0, 0.0)).chain(ways).enumerate() {
+            (at, told) = (at + true_step, told + told_step);
+            let points = scan(&start.after(&ahead(at)), &hall());
+            builder.push(keyframe(k as i64 + 1, ahead(told).se3(1.0), 0.05, points)).unwrap();
+        }
+        let submap = builder.flush().unwrap();
+        (submap.keyframes[0].inverse() * submap.keyframes[ways.len()]).translation.x - at
+    };
+    let ahead = [(0.3, 0.3); 6];
+    let back = [(0.3, 0.3), (0.3, 0.3), (0.3, 0.3), (-0.4, 0.4), (-0.4, 0.4), (0.3, 0.3)];
+    let spinning = [(0.3, 0.3), (0.3, 0.3), (0.0, 0.5), (0.0, 0.5), (0.0, 0.5), (0.3, 0.3)];
+    for ways in [ahead, back, spinning] {
+        assert!(driven(&ways).abs() < 0.05, "{ways:?}: {} m off", driven(&ways));
+    }
+}
+
 #[test]
 fn a_tilted_body_is_refused_and_height_is_left_out() {
     let tilted = |angle: f64| Se3::new(So3::exp(&Vector3::new(angle, 0.0, 0.0)), Vector3::new(0.0, 0.0, 0.7));
