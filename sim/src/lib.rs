@@ -43,4 +43,5 @@ pub mod svg;
 pub mod swarm;
 pub mod truth;
 pub mod vopr;
+pub mod wires;
 pub mod world;

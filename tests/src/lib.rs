@@ -1,6 +1,6 @@
 //! What the cross-crate tests share: running a scenario of the simulator with the real core.
 
-pub mod wires;
+pub use merganser_sim::wires;
 
 use merganser_protocol::agent::Agent;
 use merganser_sim::report::Report;

@@ -3,13 +3,19 @@
 //! from frames or scans has a local frame of its own (its first body pose) and a seeded drift on its true motion, and
 //! its manifest says so.
 
+use super::cut::NAMES;
 use super::error::{Problem, RecordingError, on};
 use super::{KEYFRAMES, MANIFEST, Recording, import_laser, import_lidar, import_mrclam, import_rgbd};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+pub use super::import_laser::{SUFFIXES as LOG_SUFFIXES, read_log};
+
 /// Robots in one data set at most: each becomes a process of its own.
 pub const ROBOTS_MAX: usize = 16;
+
+/// Robots that one log is cut into at most.
+pub const LOG_ROBOTS_MAX: usize = NAMES.len();
 
 /// What a folder holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,7 +26,7 @@ pub enum Kind {
     SevenScenes,
     /// `graph.txt` and `NNNNNN/points.bin`, or `NNNNNN.bin` and `poses.txt`.
     Lidar,
-    /// One `*.clf`, `*.clf.bz2` or `*.clf.xz`: a planar laser's log.
+    /// One `*.clf` or `*.log`, perhaps packed (`.bz2`, `.xz`): a planar laser's log.
     Carmen,
     /// `RobotN_Odometry.dat`, `RobotN_Measurement.dat` (or packed, `.xz`) and `Barcodes.dat`: robots among landmarks.
     Mrclam,
@@ -56,7 +62,7 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     }
     let why = format!(
         "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \
-         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf, *.clf.bz2, *.clf.xz), or MRCLAM logs \
+         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf or *.log, perhaps packed: .bz2, .xz), or MRCLAM logs \
          (RobotN_Odometry.dat)",
         import_rgbd::DEPTH_SUFFIX,
         import_lidar::GRAPH,
@@ -101,6 +107,19 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Prepared, Recording
         }
     };
     Ok(Prepared { recordings: open_all(folder)?, remarks })
+}
+
+/// Cuts one laser log into so many robots, in `out` (a folder per robot). There are two to
+/// [`LOG_ROBOTS_MAX`].
+///
+/// # Errors
+/// [`RecordingError`] for the first problem.
+pub fn prepare_log(log: &Path, out: &Path, robots: usize) -> Result<Prepared, RecordingError> {
+    if !(2..=LOG_ROBOTS_MAX).contains(&robots) {
+        return Err(Problem::Data(format!("can be cut into 2 to {LOG_ROBOTS_MAX} robots, not {robots}")).of(log));
+    }
+    let remarks = import_laser::import_log(log, out, robots)?;
+    Ok(Prepared { recordings: open_all(out)?, remarks })
 }
 
 /// Opens every recording in the sub-folders of `folder`.

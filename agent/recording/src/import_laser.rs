@@ -17,7 +17,7 @@ use std::io::{Cursor, Read};
 use std::path::Path;
 
 /// How the names of logs end.
-pub(super) const SUFFIXES: [&str; 3] = [".clf", ".clf.bz2", ".clf.xz"];
+pub const SUFFIXES: [&str; 6] = [".clf", ".clf.bz2", ".clf.xz", ".log", ".log.bz2", ".log.xz"];
 /// Bytes of an unpacked log at most.
 const LOG_BYTES_MAX: u64 = 512_000_000;
 /// Robots made.
@@ -44,7 +44,17 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<Vec<String>, RecordingEr
         let why = format!("holds {} CARMEN logs; one log at a time can be cut into robots", logs.len());
         return Err(Problem::Data(why).of(data));
     };
-    let log = read_log(log)?;
+    import_log(log, out, ROBOTS)
+}
+
+/// Writes so many recordings of one log into `out`, and returns what there is to say of it.
+pub(super) fn import_log(path: &Path, out: &Path, robots: usize) -> Result<Vec<String>, RecordingError> {
+    let log = read_log(path)?;
+    if log.scans.len() < robots {
+        let scans = log.scans.len();
+        let why = format!("holds {scans} scans (FLASER or ROBOTLASER1); {robots} robots need at least one each");
+        return Err(Problem::Data(why).of(path));
+    }
     let mut config = Config::default();
     config.submap.sensor = Sensor::Laser2d;
     config.submap.distance_m = 6.0;
@@ -52,8 +62,8 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<Vec<String>, RecordingEr
     config.submap.rotation_deg = 360.0;
     config.submap.keyframes_max = 32;
     config.submap.secs_max = SECS_MAX;
-    let dealt = deal(&log.scans);
-    for (robot, name) in NAMES.iter().enumerate().take(ROBOTS) {
+    let dealt = deal(&log.scans, robots);
+    for (robot, name) in NAMES.iter().enumerate().take(robots) {
         let folder = out.join(name);
         // What an earlier run left must not pass for part of this one.
         if folder.exists() {
@@ -90,6 +100,8 @@ pub(super) fn import(data: &Path, out: &Path) -> Result<Vec<String>, RecordingEr
 
 /// How the scans of a log are dealt out to the robots.
 struct Deal {
+    /// To so many.
+    robots: usize,
     /// Of scans, in all.
     count: usize,
     /// Every robot has only its turn's scans of its stretch, not all that no other robot's stretch holds.
@@ -97,32 +109,36 @@ struct Deal {
 }
 
 /// As close together as the log has them: the way by odometry tells.
-fn deal(scans: &[Scan]) -> Deal {
+fn deal(scans: &[Scan], robots: usize) -> Deal {
     let way: f64 = scans.windows(2).map(|two| (two[1].pose.translation - two[0].pose.translation).norm()).sum();
     let count = scans.len();
-    Deal { count, in_turn: way * ROBOTS as f64 <= APART_MAX_M * count as f64 }
+    Deal { robots, count, in_turn: way * robots as f64 <= APART_MAX_M * count as f64 }
 }
 
 impl Deal {
     /// The scans of a robot's stretch, with those that others are given.
     fn stretch(&self, robot: usize) -> Range<usize> {
         let share = |k: f64| ((k.clamp(0.0, 1.0) * self.count as f64) as usize).min(self.count);
-        share(robot as f64 / ROBOTS as f64 - REACH)..share((robot + 1) as f64 / ROBOTS as f64 + REACH)
+        let all = self.robots as f64;
+        share(robot as f64 / all - REACH)..share((robot + 1) as f64 / all + REACH)
     }
 
     /// The scans that a robot is given.
     fn of(&self, robot: usize) -> impl Iterator<Item = usize> {
         self.stretch(robot).filter(move |&k| {
             let drive_here = |other: &usize| self.in_turn || self.stretch(*other).contains(&k);
-            let robots: Vec<usize> = (0..ROBOTS).filter(drive_here).collect();
+            let robots: Vec<usize> = (0..self.robots).filter(drive_here).collect();
             robots[k % robots.len()] == robot
         })
     }
 
     fn how(&self, robot: usize) -> String {
         let Range { start, end } = self.stretch(robot);
-        let which =
-            if self.in_turn { "every third scan" } else { "the scans, alternately where another robot drives," };
+        let which = if self.in_turn {
+            format!("one of {} scans", self.robots)
+        } else {
+            "the scans, alternately where another robot drives,".into()
+        };
         format!("{which} from {start} to {end} (counted from 0)")
     }
 }
@@ -144,8 +160,11 @@ fn remarks(log: &Log) -> Vec<String> {
     remarks
 }
 
-/// A log, of at least one scan for each robot.
-fn read_log(path: &Path) -> Result<Log, RecordingError> {
+/// Reads a log, packed or not.
+///
+/// # Errors
+/// [`RecordingError`]: the file, or its first line that cannot be used.
+pub fn read_log(path: &Path) -> Result<Log, RecordingError> {
     let bytes = read_bytes(path)?;
     let bytes = match path.extension().and_then(|extension| extension.to_str()) {
         Some("bz2") => unpacked(path, bzip2::read::MultiBzDecoder::new(Cursor::new(bytes)))?,
@@ -163,13 +182,7 @@ fn read_log(path: &Path) -> Result<Log, RecordingError> {
         })?;
         parser.line(text).map_err(|error| Problem::Data(error.what.to_string()).at(path, error.line))?;
     }
-    let log = parser.finish();
-    if log.scans.len() < ROBOTS {
-        let why =
-            format!("holds {} scans (FLASER or ROBOTLASER1); {ROBOTS} robots need at least one each", log.scans.len());
-        return Err(Problem::Data(why).of(path));
-    }
-    Ok(log)
+    Ok(parser.finish())
 }
 
 fn unpacked(path: &Path, packed: impl Read) -> Result<Vec<u8>, RecordingError> {

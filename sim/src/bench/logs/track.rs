@@ -1,0 +1,223 @@
+//! One robot of a set: its keyframes, in which submap each came to lie, and where robot and anchors truly were.
+
+use super::find::{Set, TruthFile};
+use super::reference::{Reference, text};
+use anyhow::{Context, anyhow};
+use merganser_protocol::geometry::{Se3, So3};
+use merganser_protocol::submap::{Submap, SubmapBuilder};
+use merganser_protocol::time::Stamp;
+use merganser_recording::Recording;
+use merganser_recording::mrclam::subjects;
+use nalgebra::{Vector2, Vector3};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// A landmark of a submap that lies farther from the survey, m, is another one whose bar code was misread.
+const MISREAD_M: f64 = 1.0;
+/// What a submap says of its own keyframes is so much better than what wheels say of as long a way.
+const SUBMAP_SHARE: f64 = 0.05;
+/// Landmarks without which a submap's place in the survey is not known.
+const PLACED_MIN: usize = 4;
+
+/// One robot.
+#[derive(Debug)]
+pub struct Track {
+    /// Its name.
+    pub robot: String,
+    /// Of its keyframes.
+    pub stamps: Vec<Stamp>,
+    /// From the beginning of the set to its keyframes, s.
+    pub seconds: Vec<f64>,
+    /// `t_odometry_body` as recorded.
+    pub raw: Vec<Se3>,
+    /// The submap of each keyframe, and `t_anchor_body`.
+    pub within: Vec<(u32, Se3)>,
+    /// `t_world_body` of each keyframe, where it is known.
+    pub truth: Vec<Option<Se3>>,
+    /// `t_world_anchor`, where it is known.
+    pub anchors: BTreeMap<u32, Se3>,
+}
+
+impl Track {
+    /// Every robot of a set.
+    ///
+    /// # Errors
+    /// Files that cannot be used, keyframes that the core refuses.
+    pub fn all(set: &Set, recordings: &[Recording], reference: Option<&Reference>) -> anyhow::Result<Vec<Self>> {
+        let survey = if set.truth == TruthFile::Mrclam { survey(&set.path)? } else { BTreeMap::new() };
+        recordings.iter().map(|recording| Self::of(set, recording, reference, &survey)).collect()
+    }
+
+    fn of(
+        set: &Set,
+        recording: &Recording,
+        reference: Option<&Reference>,
+        survey: &BTreeMap<u32, Vector2<f64>>,
+    ) -> anyhow::Result<Self> {
+        let lines = recording.keyframes();
+        let stamps: Vec<Stamp> = lines.iter().map(|line| line.stamp).collect();
+        let robot = recording.manifest().robot.as_str().to_owned();
+        let truth: Vec<Option<Se3>> = match (&set.truth, reference) {
+            (_, Some(reference)) => stamps.iter().map(|stamp| Some(reference.at(*stamp)?.0)).collect(),
+            (TruthFile::Mrclam, _) => tracked(&set.path, &robot, &stamps)?,
+            _ => match recording.truth() {
+                Some(lines) => lines.iter().map(|line| Some(line.pose)).collect(),
+                None => vec![None; stamps.len()],
+            },
+        };
+        let vague = match reference {
+            Some(reference) => stamps.iter().map(|s| reference.at(*s).map_or(0.0, |(_, near)| near)).collect(),
+            None => vec![0.0; stamps.len()],
+        };
+        let mut track = Self {
+            seconds: stamps.iter().map(|stamp| stamp.secs_since(recording.begins())).collect(),
+            raw: lines.iter().map(|line| line.pose.pose).collect(),
+            within: Vec::new(),
+            anchors: BTreeMap::new(),
+            robot,
+            stamps,
+            truth,
+        };
+        let mut builder = SubmapBuilder::new(recording.manifest().config.submap.clone());
+        for index in 0..recording.len() {
+            let refused = |error| anyhow!("keyframe {index} of {}: {error}", recording.folder().display());
+            let closed = builder.push(recording.keyframe(index)?).map_err(|error| refused(error.to_string()))?;
+            closed.iter().for_each(|submap| track.take(submap, &vague, survey));
+        }
+        builder.flush().iter().for_each(|submap| track.take(submap, &vague, survey));
+        if track.within.len() != track.raw.len() {
+            return Err(anyhow!("{}: a keyframe came into no submap", recording.folder().display()));
+        }
+        Ok(track)
+    }
+
+    /// Takes the next submap.
+    fn take(&mut self, submap: &Submap, vague: &[f64], survey: &BTreeMap<u32, Vector2<f64>>) {
+        let first = self.within.len();
+        self.within.extend(submap.keyframes.iter().map(|t_anchor_body| (submap.index, *t_anchor_body)));
+        // Of a keyframe between two true poses the wheels tell, badly; where the anchor is from it, the scans, well.
+        let price = |k: &usize| vague[*k] + SUBMAP_SHARE * self.within[*k].1.translation.norm();
+        let known = (first..self.within.len()).filter(|k| self.truth[*k].is_some());
+        let best = known.min_by(|a, b| price(a).total_cmp(&price(b)));
+        let anchor = best.and_then(|k| Some(self.truth[k]? * self.within[k].1.inverse()));
+        if let Some(anchor) = anchor.or_else(|| placed(submap, survey)) {
+            self.anchors.insert(submap.index, anchor);
+            // Where only the survey tells, the robot is where its submap says.
+            for k in (first..self.within.len()).filter(|_| !survey.is_empty()) {
+                self.truth[k].get_or_insert(anchor * self.within[k].1);
+            }
+        }
+    }
+}
+
+/// Where the survey has each bar code.
+fn survey(folder: &Path) -> anyhow::Result<BTreeMap<u32, Vector2<f64>>> {
+    let mut places = BTreeMap::new();
+    for row in table(folder, "Landmark_Groundtruth.dat")?.unwrap_or_default() {
+        if let [subject, x, y, ..] = *row.as_slice() {
+            places.insert(subject as u32, Vector2::new(x, y));
+        }
+    }
+    let Some(text) = file(folder, "Barcodes.dat")? else { return Ok(BTreeMap::new()) };
+    let of = subjects(&text).map_err(|error| anyhow!("{}: {error}", folder.join("Barcodes.dat").display()))?;
+    Ok(of.into_iter().filter_map(|(code, subject)| Some((code, *places.get(&subject)?))).collect())
+}
+
+/// The poses that motion capture has of a robot, at these stamps.
+fn tracked(folder: &Path, robot: &str, stamps: &[Stamp]) -> anyhow::Result<Vec<Option<Se3>>> {
+    let number = robot.trim_start_matches("robot");
+    let Some(rows) = table(folder, &format!("Robot{number}_Groundtruth.dat"))? else {
+        return Ok(vec![None; stamps.len()]);
+    };
+    let poses: Vec<(f64, Se3)> = rows
+        .iter()
+        .filter_map(|row| match *row.as_slice() {
+            [seconds, x, y, heading] => {
+                let turn = So3::exp(&Vector3::new(0.0, 0.0, heading));
+                Some((seconds, Se3::new(turn, Vector3::new(x, y, 0.0))))
+            }
+            _ => None,
+        })
+        .collect();
+    let at = |stamp: &Stamp| {
+        let seconds = stamp.as_secs_f64();
+        let next = poses.partition_point(|(s, _)| *s <= seconds);
+        let ((s0, from), (s1, to)) = (poses.get(next.checked_sub(1)?)?, poses.get(next)?);
+        // A gap in the capture tells nothing of what was driven in it.
+        (s1 - s0 <= 1.0).then(|| from.interpolate(to, (seconds - s0) / (s1 - s0)))
+    };
+    Ok(stamps.iter().map(at).collect())
+}
+
+fn file(folder: &Path, name: &str) -> anyhow::Result<Option<String>> {
+    let paths = [folder.join(name), folder.join(format!("{name}.xz"))];
+    paths.iter().find(|path| path.is_file()).map(|path| text(path)).transpose()
+}
+
+fn table(folder: &Path, name: &str) -> anyhow::Result<Option<Vec<Vec<f64>>>> {
+    let Some(text) = file(folder, name)? else { return Ok(None) };
+    let lines = text.lines().filter(|line| !line.starts_with('#') && !line.trim().is_empty());
+    let numbers = |line: &str| line.split_ascii_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>();
+    let rows: Result<Vec<_>, _> = lines.map(numbers).collect();
+    rows.map(Some).with_context(|| folder.join(name).display().to_string())
+}
+
+/// Where the survey puts a submap's anchor.
+fn placed(submap: &Submap, survey: &BTreeMap<u32, Vector2<f64>>) -> Option<Se3> {
+    let landmarks = submap.constellation.landmarks.iter();
+    let known = landmarks.filter_map(|l| Some((l.at.xy(), *survey.get(&l.mark.label?)?)));
+    let mut pairs: Vec<(Vector2<f64>, Vector2<f64>)> = known.collect();
+    while pairs.len() >= PLACED_MIN {
+        let t = fit(&pairs);
+        let off = |(p, q): &(Vector2<f64>, Vector2<f64>)| ((t * Vector3::new(p.x, p.y, 0.0)).xy() - q).norm();
+        let worst = (0..pairs.len()).max_by(|&a, &b| off(&pairs[a]).total_cmp(&off(&pairs[b])))?;
+        if off(&pairs[worst]) <= MISREAD_M {
+            return Some(t);
+        }
+        pairs.remove(worst);
+    }
+    None
+}
+
+/// The motion in the plane that brings the first points nearest to the second (least squares).
+fn fit(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Se3 {
+    let count = pairs.len() as f64;
+    let mean =
+        |of: fn(&(Vector2<f64>, Vector2<f64>)) -> Vector2<f64>| pairs.iter().map(of).sum::<Vector2<f64>>() / count;
+    let (p0, q0) = (mean(|pair| pair.0), mean(|pair| pair.1));
+    let (mut sine, mut cosine) = (0.0, 0.0);
+    for (p, q) in pairs {
+        let (p, q) = (p - p0, q - q0);
+        cosine += p.dot(&q);
+        sine += p.x * q.y - p.y * q.x;
+    }
+    let turn = So3::exp(&Vector3::new(0.0, 0.0, libm::atan2(sine, cosine)));
+    let middle = turn.matrix() * Vector3::new(p0.x, p0.y, 0.0);
+    Se3::new(turn, Vector3::new(q0.x - middle.x, q0.y - middle.y, 0.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fit_finds_the_motion() {
+        let t = Se3::new(So3::exp(&Vector3::new(0.0, 0.0, 2.0)), Vector3::new(3.0, -1.0, 0.0));
+        let points = [[0.0, 0.0], [1.0, 0.5], [-2.0, 3.0], [4.0, 1.0]].map(|[x, y]| Vector2::new(x, y));
+        let pairs = points.map(|p| (p, (t * Vector3::new(p.x, p.y, 0.0)).xy()));
+        assert!((fit(&pairs).inverse() * t).translation.norm() < 1e-12);
+        assert!((fit(&pairs).inverse() * t).rotation.angle() < 1e-12);
+    }
+
+    #[test]
+    fn a_gap_in_the_capture_tells_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = "# Time x y heading\n10.0 0 0 0\n10.5 1 0 0.2\n20.0 5 0 0\n";
+        std::fs::write(folder.path().join("Robot3_Groundtruth.dat"), text).unwrap();
+        let at = |seconds: f64| Stamp((seconds * 1e9) as i64);
+        let poses = tracked(folder.path(), "robot3", &[at(10.25), at(15.0), at(30.0)]).unwrap();
+        assert!(poses[0].is_some_and(|t| (t.translation.x - 0.5).abs() < 0.01));
+        assert_eq!(&poses[1..], &[None, None]);
+        assert_eq!(tracked(folder.path(), "robot4", &[at(10.25)]).unwrap(), [None]);
+    }
+}
