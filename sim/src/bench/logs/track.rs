@@ -182,9 +182,8 @@ fn placed(submap: &Submap, survey: &BTreeMap<u32, Vector2<f64>>) -> Option<Se3> 
 /// The motion in the plane that brings the first points nearest to the second (least squares).
 fn fit(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Se3 {
     let count = pairs.len() as f64;
-    let mean =
-        |of: fn(&(Vector2<f64>, Vector2<f64>)) -> Vector2<f64>| pairs.iter().map(of).sum::<Vector2<f64>>() / count;
-    let (p0, q0) = (mean(|pair| pair.0), mean(|pair| pair.1));
+    let p0 = pairs.iter().map(|(p, _)| p).sum::<Vector2<f64>>() / count;
+    let q0 = pairs.iter().map(|(_, q)| q).sum::<Vector2<f64>>() / count;
     let (mut sine, mut cosine) = (0.0, 0.0);
     for (p, q) in pairs {
         let (p, q) = (p - p0, q - q0);

@@ -6,7 +6,7 @@ use super::fit::{Walls, system};
 use super::se2::Se2;
 
 use core::f64::consts::TAU;
-use libm::{exp, log};
+use libm::{atan2, exp, log};
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 /// Wheels may be off by so many times the way that they tell...
@@ -31,8 +31,12 @@ const SAME: (f64, f64) = (3.0, 0.1);
 const RADII: [f64; 6] = [4.0, 3.0, 3.0, 2.0, 2.0, 1.5];
 /// Damping of a direction that no wall tells of, in pairs.
 const DAMPING: f64 = 1e-2;
-/// A point farther than this from all walls, voxels, is of something new.
+/// A point this far from all walls, voxels, is of something new; a place this far before what was hit is free.
+const BEFORE: f64 = 3.0;
+/// Something new may stand anywhere within so many voxels.
 const NEW: f64 = 8.0;
+/// Directions in which a sensor's sight is told.
+const BEARINGS: usize = 360;
 /// Share of the points that are.
 const NEW_SHARE: f64 = 0.1;
 /// Standard deviation of a point about its wall, voxels.
@@ -84,21 +88,73 @@ impl Odometry {
     }
 }
 
-/// Logarithm of how likely the points of a scan are at a pose, per point: each lies on a wall, or is of something new.
-pub(super) fn log_likelihood(scan: &[Vector2<f64>], near: &Near, pose: &Se2) -> f64 {
-    let of = |p: &Vector2<f64>| {
-        let at = pose.apply(p);
-        let aside = near.nearest(&[at.x as f32, at.y as f32, 0.0], NEW as f32, |_| true).map_or(NEW, |mine| {
-            let d = at - Vector2::new(f64::from(mine.point[0]), f64::from(mine.point[1]));
-            let n = Vector2::new(f64::from(mine.normal[0]), f64::from(mine.normal[1]));
-            // Walls are points two voxels apart at most; what is farther along the line lies beyond its end.
-            let along = (d - n * n.dot(&d)).norm();
-            n.dot(&d).abs().max(along - 2.0)
-        });
-        let on_wall = exp(-0.5 * (aside / SIGMA) * (aside / SIGMA)) / (SIGMA * TAU.sqrt());
-        log((1.0 - NEW_SHARE) * on_wall + NEW_SHARE / (2.0 * NEW))
-    };
-    scan.iter().map(of).sum::<f64>() / scan.len().max(1) as f64
+/// How far a sensor sees through each direction: the nearest that it hit there.
+pub(super) struct Sight {
+    ranges: [f64; BEARINGS],
+}
+
+impl Sight {
+    /// Of a scan, in the frame of its sensor.
+    pub fn of(scan: &[Vector2<f64>]) -> Self {
+        let mut ranges = [f64::INFINITY; BEARINGS];
+        for p in scan {
+            let range = &mut ranges[bearing(p)];
+            *range = range.min(p.norm());
+        }
+        // Where nothing was hit, nothing is known.
+        Self { ranges: ranges.map(|range| if range.is_finite() { range } else { 0.0 }) }
+    }
+
+    /// Whether a place lies well before what was hit in its direction and beside it: there is nothing.
+    fn is_free(&self, at: &Vector2<f64>) -> bool {
+        let k = bearing(at);
+        let beside = [k + BEARINGS - 1, k, k + 1].map(|k| self.ranges[k % BEARINGS]);
+        at.norm() + BEFORE < beside.into_iter().fold(f64::INFINITY, f64::min)
+    }
+}
+
+fn bearing(p: &Vector2<f64>) -> usize {
+    ((atan2(p.y, p.x) / TAU).rem_euclid(1.0) * BEARINGS as f64) as usize % BEARINGS
+}
+
+/// What two scans and the walls before them say of the motion between the two.
+pub(super) struct Evidence<'a> {
+    /// The scan now, in the body's frame.
+    pub now: &'a [Vector2<f64>],
+    /// The scan before it, in its own.
+    pub last: &'a [Vector2<f64>],
+    /// The walls, in that frame.
+    pub near: &'a Near,
+}
+
+impl Evidence<'_> {
+    /// Logarithm of how likely the points are if the body moved so, per point. A point lies on a wall, or is of
+    /// something new; new things stand where nothing had been seen through. What comes into view for the first time
+    /// speaks neither for a motion nor against it: else the shorter of two would always fit better.
+    pub fn log_likelihood(&self, motion: &Se2) -> f64 {
+        let (before, after) = (Sight::of(self.last), Sight::of(self.now));
+        let expected = log((1.0 - NEW_SHARE) / (SIGMA * TAU.sqrt())) - 0.5;
+        let new = log(NEW_SHARE / (2.0 * NEW));
+        let of_now = |p: &Vector2<f64>| {
+            let at = motion.apply(p);
+            match self.aside(&at) {
+                Some(aside) => log(exp(expected + 0.5 - 0.5 * (aside / SIGMA) * (aside / SIGMA)) + exp(new)),
+                None if before.is_free(&at) => new,
+                None => expected,
+            }
+        };
+        let back = motion.inverse();
+        let of_last = |q: &Vector2<f64>| if after.is_free(&back.apply(q)) { new } else { expected };
+        let sum = self.now.iter().map(of_now).sum::<f64>() + self.last.iter().map(of_last).sum::<f64>();
+        sum / (self.now.len() + self.last.len()).max(1) as f64
+    }
+
+    /// How far a place is from the wall beside it, voxels; `None` if there is none.
+    fn aside(&self, at: &Vector2<f64>) -> Option<f64> {
+        let mine = self.near.nearest(&[at.x as f32, at.y as f32, 0.0], BEFORE as f32, |_| true)?;
+        let d = at - Vector2::new(f64::from(mine.point[0]), f64::from(mine.point[1]));
+        Some(Vector2::new(f64::from(mine.normal[0]), f64::from(mine.normal[1])).dot(&d).abs())
+    }
 }
 
 /// Cells with a wall in them or beside them.

@@ -5,7 +5,7 @@
 
 use super::super::near::Near;
 use super::OUT_OF_PLANE_DRIVEN;
-use super::elsewhere::{self, Odometry};
+use super::elsewhere::{self, Evidence, Odometry};
 use super::fit::{Walls, system};
 use super::lines::lines;
 use super::se2::{Se2, in_plane, in_space};
@@ -94,6 +94,7 @@ impl Sharpener {
         prior: &Matrix3<f64>,
         scan: &[Vector2<f64>],
     ) -> Option<(Se2, Matrix3<f64>)> {
+        let before = self.recent.back().map_or(&[][..], |(_, scan)| scan);
         let walls = self.walls(last);
         let near = walls.near();
         // A single scan's far points lie too sparse for lines of their own: all that is known is that they face the
@@ -107,7 +108,7 @@ impl Sharpener {
         if told.distance_squared(&settled) > CHI2_MAX {
             poses.push(*odometry);
         }
-        let (pose, doubt) = weighed(&poses, scan, &near, &told);
+        let (pose, doubt) = weighed(&poses, &Evidence { now: scan, last: before, near: &near }, &told);
         let system = system(&seen, &near, &pose, RADII[RADII.len() - 1], FACING);
         let weight = (INDEPENDENT_MAX / system.pairs.max(1) as f64).min(1.0) / (system.sigma * system.sigma);
         let information = if told.is_slip(&pose) { told.reach() } else { told.information };
@@ -142,11 +143,11 @@ fn settled(scan: &Walls, near: &Near, told: &Odometry) -> Option<Se2> {
 
 /// The most likely of several motions, by the scan and the odometry, and what the covariance grows by where others are
 /// about as likely. Only the first is taken if there is no other.
-fn weighed(poses: &[Se2], scan: &[Vector2<f64>], near: &Near, told: &Odometry) -> (Se2, Matrix3<f64>) {
+fn weighed(poses: &[Se2], evidence: &Evidence<'_>, told: &Odometry) -> (Se2, Matrix3<f64>) {
     if let [only] = poses {
         return (*only, Matrix3::zeros());
     }
-    let of = |pose: &Se2| INDEPENDENT_MAX * elsewhere::log_likelihood(scan, near, pose) + told.log_likelihood(pose);
+    let of = |pose: &Se2| INDEPENDENT_MAX * evidence.log_likelihood(pose) + told.log_likelihood(pose);
     let scores: Vec<f64> = poses.iter().map(of).collect();
     // The first of equals.
     let best = (0..poses.len()).fold(0, |best, k| if scores[k] > scores[best] { k } else { best });
