@@ -193,7 +193,7 @@ impl Wires {
 
     /// Notes what a core says of pairs that are merged.
     fn look(&mut self, robot: usize) {
-        let mut pairs = self.agents[robot].overview(self.now).frames.pairs;
+        let mut pairs = self.agents[robot].frames().pairs;
         pairs.retain(|pair| pair.status == PairStatus::Merged);
         let last = self.statements.iter().rev().find(|statement| statement.robot == robot);
         if last.map_or(!pairs.is_empty(), |last| last.pairs != pairs) {

@@ -216,3 +216,17 @@ fn files_are_found_below_and_in_order() {
         .collect();
     assert_eq!(names, ["SE3_N00020_o50_s00.corr", "SE3_N00020_o50_s01.corr", "SIM3_N00020_o50_s00.corr"]);
 }
+
+#[test]
+fn a_folder_without_logs_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("one.clf"), "").unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_merganser-sim"));
+    let out = command.args(["bench", "logs", "--data"]).arg(folder.path()).output().unwrap();
+    assert_eq!(out.status.code(), Some(2));
+    let told = String::from_utf8(out.stderr).unwrap();
+    assert!(
+        told.contains("nothing that can be played") && told.contains("no one.relations and no one.gt.tum"),
+        "{told}"
+    );
+}

@@ -9,7 +9,7 @@ use super::{KEYFRAMES, MANIFEST, Recording, import_laser, import_lidar, import_m
 use std::collections::BTreeMap;
 use std::path::Path;
 
-pub use super::import_laser::{SUFFIXES as LOG_SUFFIXES, read_log};
+pub use super::import_laser::{log_name, read_log};
 
 /// Robots in one data set at most: each becomes a process of its own.
 pub const ROBOTS_MAX: usize = 16;
@@ -54,16 +54,16 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     if any(&|name| name == import_lidar::GRAPH || name.ends_with(import_lidar::SCAN_SUFFIX)) {
         return Ok(Kind::Lidar);
     }
-    if any(&|name| import_laser::SUFFIXES.iter().any(|suffix| name.ends_with(suffix))) {
-        return Ok(Kind::Carmen);
-    }
     if any(&|name| import_mrclam::robot(name).is_some()) {
         return Ok(Kind::Mrclam);
     }
+    if !import_laser::logs(&names.iter().map(String::as_str).collect::<Vec<_>>()).is_empty() {
+        return Ok(Kind::Carmen);
+    }
     let why = format!(
         "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \
-         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf or *.log, perhaps packed: .bz2, .xz), or MRCLAM logs \
-         (RobotN_Odometry.dat)",
+         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf or *.log, perhaps packed: \
+         .bz2, .xz), or MRCLAM logs (RobotN_Odometry.dat)",
         import_rgbd::DEPTH_SUFFIX,
         import_lidar::GRAPH,
         import_lidar::POSES,
@@ -109,8 +109,7 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Prepared, Recording
     Ok(Prepared { recordings: open_all(folder)?, remarks })
 }
 
-/// Cuts one laser log into so many robots, in `out` (a folder per robot). There are two to
-/// [`LOG_ROBOTS_MAX`].
+/// Cuts one laser log into so many robots, in `out` (a folder per robot). There are two to [`LOG_ROBOTS_MAX`].
 ///
 /// # Errors
 /// [`RecordingError`] for the first problem.

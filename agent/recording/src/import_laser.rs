@@ -16,8 +16,10 @@ use merganser_protocol::submap::CovarianceOf;
 use std::io::{Cursor, Read};
 use std::path::Path;
 
-/// How the names of logs end.
-pub const SUFFIXES: [&str; 6] = [".clf", ".clf.bz2", ".clf.xz", ".log", ".log.bz2", ".log.xz"];
+/// How the names of logs end...
+const SUFFIXES: [&str; 3] = [".clf", ".clf.bz2", ".clf.xz"];
+/// ...or, where no name ends so: many other things are called a log.
+const LOOSE_SUFFIXES: [&str; 3] = [".log", ".log.bz2", ".log.xz"];
 /// Bytes of an unpacked log at most.
 const LOG_BYTES_MAX: u64 = 512_000_000;
 /// Robots made.
@@ -29,21 +31,34 @@ const APART_MAX_M: f64 = 0.5;
 /// A submap may take as long as it likes, s: wheels drift by the way, and the stamps of some logs only count scans.
 const SECS_MAX: f64 = 1e6;
 
+/// The name of a log without its ending; `None` if it is not named as one.
+pub fn log_name(file: &str) -> Option<&str> {
+    SUFFIXES.iter().chain(&LOOSE_SUFFIXES).find_map(|suffix| file.strip_suffix(suffix))
+}
+
+/// Of the names in a folder, those of logs.
+pub(super) fn logs<'a>(names: &[&'a str]) -> Vec<&'a str> {
+    let ending = |suffixes: &[&str]| -> Vec<&'a str> {
+        names.iter().copied().filter(|name| suffixes.iter().any(|suffix| name.ends_with(suffix))).collect()
+    };
+    let sure = ending(&SUFFIXES);
+    if sure.is_empty() { ending(&LOOSE_SUFFIXES) } else { sure }
+}
+
 /// Writes three recordings into `out`, and returns what there is to say of the log.
 pub(super) fn import(data: &Path, out: &Path) -> Result<Vec<String>, RecordingError> {
-    let mut logs = Vec::new();
+    let mut names = Vec::new();
     for entry in on(data, data.read_dir())? {
-        let path = on(data, entry)?.path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if SUFFIXES.iter().any(|suffix| name.ends_with(suffix)) {
-            logs.push(path);
-        }
+        names.push(on(data, entry)?.file_name().to_string_lossy().into_owned());
     }
-    logs.sort();
-    let [log] = logs.as_slice() else {
-        let why = format!("holds {} CARMEN logs; one log at a time can be cut into robots", logs.len());
+    names.sort();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let found = logs(&names);
+    let [log] = found.as_slice() else {
+        let why = format!("holds {} CARMEN logs; one log at a time can be cut into robots", found.len());
         return Err(Problem::Data(why).of(data));
     };
+    let log = &data.join(log);
     import_log(log, out, ROBOTS)
 }
 
@@ -189,4 +204,19 @@ fn unpacked(path: &Path, packed: impl Read) -> Result<Vec<u8>, RecordingError> {
     let mut bytes = Vec::new();
     on(path, packed.take(LOG_BYTES_MAX + 1).read_to_end(&mut bytes))?;
     Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{log_name, logs};
+
+    /// Many things are called a log: beside one that is surely a laser's, none of them is.
+    #[test]
+    fn what_is_only_called_a_log_is_one_where_nothing_else_is() {
+        assert_eq!(logs(&["aces.clf.bz2", "build.log", "notes.txt"]), ["aces.clf.bz2"]);
+        assert_eq!(logs(&["intel.log.xz", "notes.txt"]), ["intel.log.xz"]);
+        assert_eq!(logs(&["a.clf", "b.clf.xz"]), ["a.clf", "b.clf.xz"], "two, which are refused");
+        assert!(logs(&["notes.txt"]).is_empty());
+        assert_eq!((log_name("intel.log.xz"), log_name("notes.txt")), (Some("intel"), None));
+    }
 }

@@ -171,6 +171,7 @@ mod tests {
     fn logs_become_recordings_of_landmarks() {
         let (data, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         write_good(data.path());
+        fs::write(data.path().join("run.log"), "what a tool said").unwrap();
         assert_eq!(detect(data.path()).unwrap(), Kind::Mrclam);
         let recordings = prepare(data.path(), out.path(), 1).unwrap().recordings;
         assert_eq!(recordings.iter().map(|r| r.manifest().robot.as_str()).collect::<Vec<_>>(), ["robot1", "robot2"]);

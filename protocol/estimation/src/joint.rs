@@ -15,7 +15,7 @@ use super::graph::{Factor, Graph};
 use super::joint_covariance::{JointError, JointPoses};
 use super::node::{Label, Node};
 use super::optimality::Optimality;
-use super::pairs::{self, Pair};
+use super::pairs::{self, Pair, PairEstimate};
 use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
 use super::solve::{ComponentError, Solution, SolveError, solve_within};
@@ -164,42 +164,6 @@ pub struct EdgeEstimate {
     pub(super) joins: bool,
     /// Why it does not count; `None` if it does.
     pub unused: Option<Unused>,
-}
-
-/// A pair of frames with at least one agreed alignment, `a < b`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PairEstimate {
-    /// First frame.
-    pub a: FrameId,
-    /// Second frame.
-    pub b: FrameId,
-    /// Merged, or why not.
-    pub status: PairStatus,
-    /// Agreed alignments that could be considered.
-    pub agreed: usize,
-    /// Alignments in the joint estimate.
-    pub used: usize,
-    /// log₁₀ of the number of false alarms of the consensus.
-    pub log10_nfa: Option<f64>,
-    /// `t_a_b` between the frames' origins: the joint estimate if their component holds both, the pair's own consensus
-    /// otherwise.
-    pub t_a_b: Option<Relative>,
-    /// Of a merged pair: how the two lie in the middle of what both saw. The origins of the frames may be far from it, and
-    /// [`PairEstimate::t_a_b`] as uncertain as the way there.
-    pub middle: Option<Middle>,
-    /// The pair agrees with itself but contradicts a loop of stronger pairs, so it was left out.
-    pub contradicts_loop: bool,
-}
-
-/// How two anchors of different frames lie by the joint estimate.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Middle {
-    /// In the first frame of the pair.
-    pub i: SubmapId,
-    /// In the second.
-    pub j: SubmapId,
-    /// `t_i_j`, cross-correlations included.
-    pub t_i_j: Relative,
 }
 
 /// Frames that are connected, solved together.

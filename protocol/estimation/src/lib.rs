@@ -57,9 +57,8 @@ use merganser_geometry as geometry;
 use merganser_types::{config, ids, kinds};
 
 pub use admission::Kind as EdgeKind;
-pub use joint::{
-    AgreedAlignment, EdgeEstimate, FrameChain, JointEstimate, MapProblem, PairEstimate, Unused, solve_map,
-};
+pub use joint::{AgreedAlignment, EdgeEstimate, FrameChain, JointEstimate, MapProblem, Unused, solve_map};
+pub use pairs::{Middle, PairEstimate};
 
 #[cfg(test)]
 mod hostile_tests;

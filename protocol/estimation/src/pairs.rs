@@ -8,7 +8,7 @@
 use super::admission::{Admission, Chain};
 use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
 use super::graph::is_rigid;
-use super::joint::{AgreedAlignment, EdgeEstimate, JointEstimate, Middle, PairEstimate, Unused};
+use super::joint::{AgreedAlignment, EdgeEstimate, JointEstimate, Unused};
 use super::loops::{self, Loops};
 use crate::config::EstimateConfig;
 use crate::geometry::{Disagreement, Relative, Sim3, chi2};
@@ -28,6 +28,42 @@ const AMBIGUOUS_SHARE: f64 = 0.8;
 /// Loop closures of one frame that its odometry refutes, or that fit at another place as well, from which on they tell
 /// of a place that repeats itself: fewer may be chance.
 const REPEATED_MIN: usize = 2;
+
+/// A pair of frames with at least one agreed alignment, `a < b`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PairEstimate {
+    /// First frame.
+    pub a: FrameId,
+    /// Second frame.
+    pub b: FrameId,
+    /// Merged, or why not.
+    pub status: PairStatus,
+    /// Agreed alignments that could be considered.
+    pub agreed: usize,
+    /// Alignments in the joint estimate.
+    pub used: usize,
+    /// log₁₀ of the number of false alarms of the consensus.
+    pub log10_nfa: Option<f64>,
+    /// `t_a_b` between the frames' origins: the joint estimate if their component holds both, the pair's own consensus
+    /// otherwise.
+    pub t_a_b: Option<Relative>,
+    /// Of a merged pair: how the two lie in the middle of what both saw. The origins of the frames may be far from it,
+    /// and [`PairEstimate::t_a_b`] as uncertain as the way there.
+    pub middle: Option<Middle>,
+    /// The pair agrees with itself but contradicts a loop of stronger pairs, so it was left out.
+    pub contradicts_loop: bool,
+}
+
+/// How two anchors of different frames lie by the joint estimate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Middle {
+    /// In the first frame of the pair.
+    pub i: SubmapId,
+    /// In the second.
+    pub j: SubmapId,
+    /// `t_i_j`, cross-correlations included.
+    pub t_i_j: Relative,
+}
 
 /// A pair of frames, `a < b`, and what its own alignments say.
 pub(super) struct Pair {

@@ -4,8 +4,9 @@
 use super::two_sided;
 use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
+use crate::estimate::PairEstimate;
 use crate::estimate::extrapolation::End;
-use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, PairEstimate, Shortfall, Unused, solve_map};
+use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Shortfall, Unused, solve_map};
 use crate::estimate::node::Node;
 use crate::estimate::optimality::Optimality;
 use crate::estimate::solve::ComponentError;

@@ -28,7 +28,7 @@ impl Agent {
     pub fn overview(&self, now: Instant) -> Snapshot {
         Snapshot {
             status: self.status(),
-            frames: self.frames_view(),
+            frames: self.frames(),
             poses: self.poses_view(now),
             map: MapView { submaps: Vec::new() },
             graph: self.graph_view(),
@@ -90,7 +90,8 @@ impl Agent {
         names
     }
 
-    fn frames_view(&self) -> FramesView {
+    /// `view/frames` alone.
+    pub fn frames(&self) -> FramesView {
         let mut submaps: BTreeMap<FrameId, u64> = BTreeMap::new();
         for (id, _) in self.replication.knowledge().submaps() {
             *submaps.entry(id.frame).or_default() += 1;

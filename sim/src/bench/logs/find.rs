@@ -1,7 +1,7 @@
 //! What lies in a folder and can be played: laser logs with a truth beside them, and whatever else the importer knows.
 
 use merganser_protocol::config::Sensor;
-use merganser_recording::import::{Kind, LOG_SUFFIXES, detect, prepare, prepare_log};
+use merganser_recording::import::{Kind, Prepared, detect, log_name, prepare, prepare_log};
 use merganser_recording::{Recording, TRUTH};
 use std::path::{Path, PathBuf};
 
@@ -53,9 +53,10 @@ fn look(folder: &Path, depth: usize, sets: &mut Vec<Set>, left_out: &mut Vec<Str
         .collect::<std::io::Result<_>>()?;
     entries.sort();
     for path in entries.iter().filter(|path| path.is_file()) {
-        let Some(name) = log_name(path) else { continue };
-        match truth_beside(folder, &name) {
-            Some(truth) => sets.push(Set { name, path: path.clone(), truth }),
+        let file = path.file_name().unwrap_or_default().to_string_lossy();
+        let Some(name) = log_name(&file) else { continue };
+        match truth_beside(folder, name) {
+            Some(truth) => sets.push(Set { name: name.into(), path: path.clone(), truth }),
             None => left_out.push(format!("{}: no {name}.relations and no {name}.gt.tum beside it", path.display())),
         }
     }
@@ -85,12 +86,6 @@ fn look(folder: &Path, depth: usize, sets: &mut Vec<Set>, left_out: &mut Vec<Str
     Ok(())
 }
 
-/// What a log is called without its endings.
-fn log_name(path: &Path) -> Option<String> {
-    let name = path.file_name()?.to_string_lossy().into_owned();
-    LOG_SUFFIXES.iter().find_map(|suffix| name.strip_suffix(suffix)).map(str::to_owned)
-}
-
 fn truth_beside(folder: &Path, name: &str) -> Option<TruthFile> {
     let there = |endings: [&str; 2]| {
         endings.iter().map(|ending| folder.join(format!("{name}{ending}"))).find(|path| path.is_file())
@@ -101,14 +96,14 @@ fn truth_beside(folder: &Path, name: &str) -> Option<TruthFile> {
 }
 
 impl Set {
-    /// Its robots, made in `out` where they are not recordings already; of a log so many.
+    /// Its robots, made in `out` where they are not recordings already; of a log so many. And what was amiss with it.
     ///
     /// # Errors
     /// Data that cannot be used.
-    pub fn recordings(&self, out: &Path, robots: usize) -> anyhow::Result<Vec<Recording>> {
+    pub fn recordings(&self, out: &Path, robots: usize) -> anyhow::Result<Prepared> {
         Ok(match &self.truth {
-            TruthFile::Relations(_) | TruthFile::Tum(_) => prepare_log(&self.path, out, robots)?.recordings,
-            TruthFile::Mrclam | TruthFile::Recorded => prepare(&self.path, out, SEED)?.recordings,
+            TruthFile::Relations(_) | TruthFile::Tum(_) => prepare_log(&self.path, out, robots)?,
+            TruthFile::Mrclam | TruthFile::Recorded => prepare(&self.path, out, SEED)?,
         })
     }
 }

@@ -4,7 +4,7 @@ use super::track::Track;
 use crate::wires::{Statement, Wires};
 use merganser_protocol::geometry::{PoseWithCovariance, Se3, chi2};
 use merganser_protocol::kinds::PairStatus;
-use merganser_protocol::snapshot::{EdgeView, Snapshot, pose, relation};
+use merganser_protocol::snapshot::{EdgeView, PairView, Snapshot, pose, relation};
 use merganser_protocol::time::Instant;
 use nalgebra::{DMatrix, DVector, Vector6};
 use std::collections::{BTreeMap, BTreeSet};
@@ -26,7 +26,7 @@ pub struct PairFate {
     pub overlap_secs: Option<f64>,
     /// Until the first of them called the pair merged, s.
     pub merged_secs: Option<f64>,
-    /// Merged at the end, by both.
+    /// Merged at the end, by both, directly or through others.
     pub merged: bool,
     /// A robot called it merged and later did not.
     pub fell_apart: usize,
@@ -159,14 +159,16 @@ impl Judge<'_> {
             let mut before: BTreeSet<(usize, usize)> = BTreeSet::new();
             for (k, statement) in own.iter().enumerate() {
                 let until = own.get(k + 1).map_or(end, |next| next.at);
-                let mut now = BTreeSet::new();
-                for pair in &statement.pairs {
-                    let (Some(a), Some(b)) = (self.robot(&pair.a), self.robot(&pair.b)) else { continue };
-                    let key = (a.min(b), a.max(b));
-                    now.insert(key);
-                    let Some(fate) = judged.pairs.get_mut(&key) else { continue };
-                    let secs = statement.at.since(Instant::ZERO).as_secs_f64();
+                let named = |pair: &PairView| Some((self.robot(&pair.a)?, self.robot(&pair.b)?));
+                let now = together(self.tracks.len(), statement.pairs.iter().filter_map(named));
+                let secs = statement.at.since(Instant::ZERO).as_secs_f64();
+                for fate in judged.pairs.iter_mut().filter(|(key, _)| now.contains(key)).map(|(_, fate)| fate) {
                     fate.merged_secs = Some(fate.merged_secs.map_or(secs, |first| first.min(secs)));
+                }
+                for pair in &statement.pairs {
+                    let Some((a, b)) = named(pair) else { continue };
+                    let key = (a.min(b), a.max(b));
+                    let Some(fate) = judged.pairs.get_mut(&key) else { continue };
                     let ends = pair.middle.as_ref().and_then(|middle| {
                         let (_, i) = self.anchor(&middle.i)?;
                         let (_, j) = self.anchor(&middle.j)?;
@@ -259,6 +261,17 @@ impl Judge<'_> {
     }
 }
 
+/// Every two of so many robots that pairs tie together, directly or through others.
+fn together(robots: usize, pairs: impl Iterator<Item = (usize, usize)>) -> BTreeSet<(usize, usize)> {
+    let mut group: Vec<usize> = (0..robots).collect();
+    for (a, b) in pairs {
+        let (from, to) = (group[a], group[b]);
+        group.iter_mut().filter(|g| **g == from).for_each(|g| *g = to);
+    }
+    let all = (0..robots).flat_map(|a| (a + 1..robots).map(move |b| (a, b)));
+    all.filter(|(a, b)| group[*a] == group[*b]).collect()
+}
+
 fn length(track: &Track) -> f64 {
     let steps = track.raw.windows(2);
     steps.map(|two| (two[1].translation - two[0].translation).norm()).sum()
@@ -269,7 +282,7 @@ mod tests {
     use super::*;
     use core::time::Duration;
     use merganser_protocol::geometry::{Covariance, Relative, So3};
-    use merganser_protocol::snapshot::{MiddleView, PairView, RelationView};
+    use merganser_protocol::snapshot::{MiddleView, RelationView};
     use nalgebra::Vector3;
 
     fn along(x: f64) -> Se3 {
@@ -332,6 +345,13 @@ mod tests {
         assert!(fate.merged && fate.wrong == 0 && fate.fell_apart == 0, "{fate:?}");
         // The second is 10 s behind, and near from 2 m on.
         assert_eq!((fate.overlap_secs, fate.merged_secs), (Some(18.0), Some(20.0)));
+    }
+
+    #[test]
+    fn robots_are_together_through_others_too() {
+        let pairs = |ties: &[(usize, usize)]| together(4, ties.iter().copied()).into_iter().collect::<Vec<_>>();
+        assert_eq!(pairs(&[(2, 0), (3, 2)]), [(0, 2), (0, 3), (2, 3)]);
+        assert_eq!(pairs(&[]), []);
     }
 
     #[test]

@@ -50,6 +50,8 @@ pub struct Reference {
     poses: BTreeMap<Stamp, Se3>,
     /// Relations that were published.
     pub relations: Vec<Stated>,
+    /// What was amiss with the truth, a sentence each.
+    pub remarks: Vec<String>,
 }
 
 impl Reference {
@@ -66,12 +68,17 @@ impl Reference {
         let Log { scans, .. } = read_log(&set.path)?;
         let odometry: BTreeMap<Stamp, Se3> = scans.iter().map(|scan| (scan.stamp, scan.pose)).collect();
         let rows = rows(path)?;
+        let all = rows.len();
         let reference = if is_tum {
-            Self { odometry, poses: rows.iter().map(tum).collect(), relations: Vec::new() }
+            let poses: BTreeMap<Stamp, Se3> = rows.iter().map(tum).collect();
+            let known = poses.keys().filter(|stamp| nearest(&odometry, **stamp).is_some()).count();
+            let remarks = unknown(path, all - known, all);
+            Self { odometry, poses, relations: Vec::new(), remarks }
         } else {
             let relations: Vec<Stated> = rows.iter().filter_map(|row| relation(row, &odometry)).collect();
             let poses = way(&odometry, &relations).with_context(|| path.display().to_string())?;
-            Self { odometry, poses, relations }
+            let remarks = unknown(path, all - relations.len(), all);
+            Self { odometry, poses, relations, remarks }
         };
         if reference.poses.is_empty() {
             return Err(anyhow!("{}: no line is of a stamp of {}", path.display(), set.path.display()));
@@ -111,6 +118,12 @@ pub fn mended(raw: [&Se3; 2], here: &Se3, known: [&Se3; 2]) -> Se3 {
     if since + left > 0.0 { from.interpolate(&to, since / (since + left)) } else { from }
 }
 
+/// Lines that are of no scan of the log.
+fn unknown(path: &Path, lines: usize, all: usize) -> Vec<String> {
+    let told = || format!("{}: {lines} of {all} lines name no scan of the log; they are left out", path.display());
+    (lines > 0).then(told).into_iter().collect()
+}
+
 /// The numbers of each line that is no remark.
 fn rows(path: &Path) -> anyhow::Result<Vec<[f64; 8]>> {
     let mut rows = Vec::new();
@@ -135,13 +148,18 @@ pub fn text(path: &Path) -> anyhow::Result<String> {
         let file = std::fs::File::open(path)?;
         let mut text = String::new();
         if path.extension().is_some_and(|ending| ending == "xz") {
-            lzma_rust2::XzReader::new(std::io::BufReader::new(file), true).take(BYTES_MAX).read_to_string(&mut text)?;
+            let unpacked = lzma_rust2::XzReader::new(std::io::BufReader::new(file), true);
+            unpacked.take(BYTES_MAX + 1).read_to_string(&mut text)?;
         } else {
-            file.take(BYTES_MAX).read_to_string(&mut text)?;
+            file.take(BYTES_MAX + 1).read_to_string(&mut text)?;
         }
         Ok(text)
     };
-    read().with_context(|| path.display().to_string())
+    let text = read().with_context(|| path.display().to_string())?;
+    if text.len() as u64 > BYTES_MAX {
+        return Err(anyhow!("{}: is longer than {BYTES_MAX} bytes; cut it", path.display()));
+    }
+    Ok(text)
 }
 
 fn stamp(seconds: f64) -> Stamp {

@@ -2,7 +2,7 @@
 
 use super::find::{Set, TruthFile};
 use super::reference::{Reference, text};
-use anyhow::{Context, anyhow};
+use anyhow::anyhow;
 use merganser_protocol::geometry::{Se3, So3};
 use merganser_protocol::submap::{Submap, SubmapBuilder};
 use merganser_protocol::time::Stamp;
@@ -114,9 +114,8 @@ impl Track {
 fn survey(folder: &Path) -> anyhow::Result<BTreeMap<u32, Vector2<f64>>> {
     let mut places = BTreeMap::new();
     for row in table(folder, "Landmark_Groundtruth.dat")?.unwrap_or_default() {
-        if let [subject, x, y, ..] = *row.as_slice() {
-            places.insert(subject as u32, Vector2::new(x, y));
-        }
+        let [subject, x, y] = row;
+        places.insert(subject as u32, Vector2::new(x, y));
     }
     let Some(text) = file(folder, "Barcodes.dat")? else { return Ok(BTreeMap::new()) };
     let of = subjects(&text).map_err(|error| anyhow!("{}: {error}", folder.join("Barcodes.dat").display()))?;
@@ -129,16 +128,10 @@ fn tracked(folder: &Path, robot: &str, stamps: &[Stamp]) -> anyhow::Result<Vec<O
     let Some(rows) = table(folder, &format!("Robot{number}_Groundtruth.dat"))? else {
         return Ok(vec![None; stamps.len()]);
     };
-    let poses: Vec<(f64, Se3)> = rows
-        .iter()
-        .filter_map(|row| match *row.as_slice() {
-            [seconds, x, y, heading] => {
-                let turn = So3::exp(&Vector3::new(0.0, 0.0, heading));
-                Some((seconds, Se3::new(turn, Vector3::new(x, y, 0.0))))
-            }
-            _ => None,
-        })
-        .collect();
+    let pose = |[seconds, x, y, heading]: [f64; 4]| {
+        (seconds, Se3::new(So3::exp(&Vector3::new(0.0, 0.0, heading)), Vector3::new(x, y, 0.0)))
+    };
+    let poses: Vec<(f64, Se3)> = rows.into_iter().map(pose).collect();
     let at = |stamp: &Stamp| {
         let seconds = stamp.as_secs_f64();
         let next = poses.partition_point(|(s, _)| *s <= seconds);
@@ -154,12 +147,20 @@ fn file(folder: &Path, name: &str) -> anyhow::Result<Option<String>> {
     paths.iter().find(|path| path.is_file()).map(|path| text(path)).transpose()
 }
 
-fn table(folder: &Path, name: &str) -> anyhow::Result<Option<Vec<Vec<f64>>>> {
+/// The first numbers of each line that is no remark.
+fn table<const N: usize>(folder: &Path, name: &str) -> anyhow::Result<Option<Vec<[f64; N]>>> {
     let Some(text) = file(folder, name)? else { return Ok(None) };
-    let lines = text.lines().filter(|line| !line.starts_with('#') && !line.trim().is_empty());
-    let numbers = |line: &str| line.split_ascii_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>();
-    let rows: Result<Vec<_>, _> = lines.map(numbers).collect();
-    rows.map(Some).with_context(|| folder.join(name).display().to_string())
+    let mut rows = Vec::new();
+    for (line, text) in text.lines().enumerate().filter(|(_, text)| !text.starts_with('#') && !text.trim().is_empty()) {
+        let words: Vec<f64> = text.split_ascii_whitespace().map_while(|word| word.parse().ok()).collect();
+        let row = words
+            .get(..N)
+            .and_then(|row| <[f64; N]>::try_from(row).ok())
+            .filter(|row| row.iter().all(|x| x.is_finite()));
+        let place = folder.join(name);
+        rows.push(row.ok_or_else(|| anyhow!("{}:{}: {N} numbers are due", place.display(), line + 1))?);
+    }
+    Ok(Some(rows))
 }
 
 /// Where the survey puts a submap's anchor.

@@ -21,7 +21,7 @@ const TURN: f64 = 0.45;
 const STEP: (f64, f64) = (2.0, 0.05);
 /// Points of a scan that are looked at.
 const POINTS: usize = 120;
-/// Cells to each side at most; what lies beyond is not looked at.
+/// Cells along either axis at most; what lies beyond is not looked at.
 const SIDE_MAX: usize = 1024;
 /// Places that are looked at more closely, at most...
 const CANDIDATES_MAX: usize = 4;
@@ -70,21 +70,26 @@ impl Odometry {
         off.dot(&(self.information * off))
     }
 
-    /// Logarithm of how likely a motion is, over that of the one they tell: they hold, or, seldom, anything in reach is
-    /// as likely.
-    pub fn log_likelihood(&self, motion: &Se2) -> f64 {
+    /// How likely a motion is if the wheels hold, and if they tell nothing and anything in reach is as likely: both over
+    /// the density of the motion that they tell.
+    fn likelihoods(&self, motion: &Se2) -> [f64; 2] {
         let radius = self.radius();
-        let volume = core::f64::consts::PI * radius * radius * 2.0 * TURN;
-        let normal = (TAU * TAU * TAU / self.information.determinant()).sqrt();
-        log((1.0 - SLIP_SHARE) * exp(-0.5 * self.distance_squared(motion)) + SLIP_SHARE * (normal / volume).min(1.0))
+        let reach = core::f64::consts::PI * radius * radius * 2.0 * TURN;
+        let spread = (TAU * TAU * TAU / self.information.determinant()).sqrt();
+        let hold = exp(-0.5 * self.distance_squared(motion));
+        [(1.0 - SLIP_SHARE) * hold, SLIP_SHARE * (spread / reach).min(1.0)]
     }
 
-    /// Whether a motion is more likely as one of which the wheels tell nothing.
+    /// Logarithm of how likely a motion is.
+    pub fn log_likelihood(&self, motion: &Se2) -> f64 {
+        let [hold, slip] = self.likelihoods(motion);
+        log(hold + slip)
+    }
+
+    /// Whether a motion is likelier as one of which the wheels tell nothing.
     pub fn is_slip(&self, motion: &Se2) -> bool {
-        let radius = self.radius();
-        let volume = core::f64::consts::PI * radius * radius * 2.0 * TURN;
-        let normal = (TAU * TAU * TAU / self.information.determinant()).sqrt();
-        (1.0 - SLIP_SHARE) * exp(-0.5 * self.distance_squared(motion)) < SLIP_SHARE * (normal / volume).min(1.0)
+        let [hold, slip] = self.likelihoods(motion);
+        hold < slip
     }
 }
 
@@ -119,20 +124,24 @@ fn bearing(p: &Vector2<f64>) -> usize {
 
 /// What two scans and the walls before them say of the motion between the two.
 pub(super) struct Evidence<'a> {
-    /// The scan now, in the body's frame.
-    pub now: &'a [Vector2<f64>],
-    /// The scan before it, in its own.
-    pub last: &'a [Vector2<f64>],
-    /// The walls, in that frame.
-    pub near: &'a Near,
+    now: &'a [Vector2<f64>],
+    last: &'a [Vector2<f64>],
+    near: &'a Near,
+    /// From where the scans were made, each in its own frame.
+    seen: [Sight; 2],
 }
 
-impl Evidence<'_> {
+impl<'a> Evidence<'a> {
+    /// Of the scan now, in the body's frame; of the scan before it, in its own; and of the walls, in that frame.
+    pub fn new(now: &'a [Vector2<f64>], last: &'a [Vector2<f64>], near: &'a Near) -> Self {
+        Self { now, last, near, seen: [Sight::of(last), Sight::of(now)] }
+    }
+
     /// Logarithm of how likely the points are if the body moved so, per point. A point lies on a wall, or is of
     /// something new; new things stand where nothing had been seen through. What comes into view for the first time
     /// speaks neither for a motion nor against it: else the shorter of two would always fit better.
     pub fn log_likelihood(&self, motion: &Se2) -> f64 {
-        let (before, after) = (Sight::of(self.last), Sight::of(self.now));
+        let [before, after] = &self.seen;
         let expected = log((1.0 - NEW_SHARE) / (SIGMA * TAU.sqrt())) - 0.5;
         let new = log(NEW_SHARE / (2.0 * NEW));
         let of_now = |p: &Vector2<f64>| {

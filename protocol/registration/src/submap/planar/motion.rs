@@ -108,7 +108,7 @@ impl Sharpener {
         if told.distance_squared(&settled) > CHI2_MAX {
             poses.push(*odometry);
         }
-        let (pose, doubt) = weighed(&poses, &Evidence { now: scan, last: before, near: &near }, &told);
+        let (pose, doubt) = weighed(&poses, || Evidence::new(scan, before, &near), &told);
         let system = system(&seen, &near, &pose, RADII[RADII.len() - 1], FACING);
         let weight = (INDEPENDENT_MAX / system.pairs.max(1) as f64).min(1.0) / (system.sigma * system.sigma);
         let information = if told.is_slip(&pose) { told.reach() } else { told.information };
@@ -143,10 +143,11 @@ fn settled(scan: &Walls, near: &Near, told: &Odometry) -> Option<Se2> {
 
 /// The most likely of several motions, by the scan and the odometry, and what the covariance grows by where others are
 /// about as likely. Only the first is taken if there is no other.
-fn weighed(poses: &[Se2], evidence: &Evidence<'_>, told: &Odometry) -> (Se2, Matrix3<f64>) {
+fn weighed<'a>(poses: &[Se2], evidence: impl Fn() -> Evidence<'a>, told: &Odometry) -> (Se2, Matrix3<f64>) {
     if let [only] = poses {
         return (*only, Matrix3::zeros());
     }
+    let evidence = evidence();
     let of = |pose: &Se2| INDEPENDENT_MAX * evidence.log_likelihood(pose) + told.log_likelihood(pose);
     let scores: Vec<f64> = poses.iter().map(of).collect();
     // The first of equals.

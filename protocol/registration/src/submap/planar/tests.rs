@@ -196,6 +196,36 @@ fn scans_mend_wheels_that_are_wrong_by_far_more_than_they_say() {
     }
 }
 
+/// At each step of a bare corridor a stretch of wall comes into view for the first time: that is no reason to believe
+/// that the robot came less far than its wheels say.
+#[test]
+fn what_comes_into_view_shortens_no_motion() {
+    let mut builder = SubmapBuilder::new(config());
+    for k in 0..8 {
+        let at = 1.2 * f64::from(k);
+        let points = scan(&ahead(at), &corridor(false));
+        let near = points.into_iter().filter(|p| p[0].hypot(p[1]) < 2.0).collect();
+        builder.push(keyframe(i64::from(k) + 1, ahead(at).se3(1.0), 0.2, near)).unwrap();
+    }
+    let submap = builder.flush().unwrap();
+    assert_eq!(submap.keyframes.len(), 8, "a slip was believed, which blurs a submap");
+    let moved = (submap.keyframes[0].inverse() * submap.keyframes[7]).translation.x;
+    assert!((moved - 8.4).abs() < 0.2, "{moved}");
+}
+
+/// Points far beyond what is looked at, and no walls at all, cost neither memory nor a panic.
+#[test]
+fn scans_of_any_size_are_taken() {
+    for far in [1e3_f32, 1e9, 1e30] {
+        let mut builder = SubmapBuilder::new(config());
+        for k in 0..4 {
+            let points = vec![[far, 0.0, 0.0], [0.0, -far, 0.0], [1.0, 1.0, 0.0]];
+            builder.push(keyframe(i64::from(k) + 1, ahead(0.3 * f64::from(k)).se3(1.0), 0.05, points)).unwrap();
+        }
+        assert!(builder.flush().is_some_and(|s| s.keyframes.iter().all(|t| t.translation.norm() < 2.0)), "{far}");
+    }
+}
+
 #[test]
 fn a_tilted_body_is_refused_and_height_is_left_out() {
     let tilted = |angle: f64| Se3::new(So3::exp(&Vector3::new(angle, 0.0, 0.0)), Vector3::new(0.0, 0.0, 0.7));
