@@ -27,6 +27,8 @@ pub(super) const SCAN_SUFFIX: &str = ".bin";
 const SCAN_NANOS: i64 = 100_000_000;
 /// A LiDAR odometry: 1 % of the way and a tenth of a degree per scan.
 const DRIFT: Drift = Drift { per_metre: 0.01, floor_m: 0.01, step_deg: 0.1 };
+/// The greatest speeds that an agent can be told to believe, m/s and °/s.
+const FASTEST: (f64, f64) = (1e4, 1e6);
 /// With fewer scans than this per robot, two robots are made instead of three.
 const SCANS_PER_ROBOT_MIN: usize = 4;
 /// Submaps a robot should have at least, so that three alignments can be found.
@@ -67,6 +69,10 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
     config.submap.sensor = Sensor::Lidar3d;
     config.submap.voxel_m = 0.5;
     config.submap.distance_m = 10.0;
+    if graph.is_file() {
+        // A dump numbers its keyframes: their times are not known, so that no speed is too fast.
+        (config.submap.speed_max_m_s, config.submap.turn_max_deg_s) = FASTEST;
+    }
     config.submap.keyframes_max = (scans.len() / (robots * SUBMAPS_PER_ROBOT)).clamp(1, 10) as u32;
     let origin = format!("{} LiDAR scans ({stated} poses) cut into {robots} robots by time", scans.len());
     let cut = Cut { robots, sensor: "lidar3d", origin, drift: DRIFT, seed, config };

@@ -8,7 +8,7 @@ use merganser::recording::import::prepare;
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::snapshot::{EdgeView, Snapshot};
 use merganser_protocol::submap::{Submap, SubmapBuilder};
-use merganser_recording::mrclam::subjects;
+use merganser_sim::bench::logs::mrclam::{Survey, placed, survey};
 use merganser_tests::real_data;
 use merganser_tests::wires::play;
 use nalgebra::{Matrix3, Vector3};
@@ -19,31 +19,18 @@ const RMS_MAX: f64 = 0.15;
 /// An alignment is false if it is farther off than this, m and °, from what the survey says of its two submaps, which
 /// is itself known to some centimetres and degrees.
 const FALSE: (f64, f64) = (0.5, 10.0);
-/// A landmark of a submap that is this far from the survey, m, is another one whose bar code was misread.
-const MISREAD: f64 = 1.0;
-/// Landmarks without which a submap's place in the survey is not known.
-const PLACED_MIN: usize = 4;
 /// The list of bar codes and the survey disagree about two landmarks, whose names are exchanged in one of them: as
 /// printed, all five robots see each of the two where the other one is, 2.9 m away.
 const EXCHANGED: [u32; 2] = [18, 61];
 
-/// Where the survey has each bar code.
-fn survey(data: &std::path::Path, exchanged: bool) -> BTreeMap<u32, Vector3<f64>> {
-    let read = |name: &str| std::fs::read_to_string(data.join(name)).unwrap();
-    let mut places = BTreeMap::new();
-    for line in read("Landmark_Groundtruth.dat").lines().filter(|line| !line.starts_with('#')) {
-        let numbers: Vec<f64> = line.split_ascii_whitespace().map(|word| word.parse().unwrap()).collect();
-        if let [subject, x, y, ..] = *numbers.as_slice() {
-            places.insert(subject as u32, Vector3::new(x, y, 0.0));
-        }
-    }
-    let of = subjects(&read("Barcodes.dat")).unwrap();
+/// Where the survey has each bar code, with the two names exchanged.
+fn exchanged(printed: &Survey) -> Survey {
     let name = |code: u32| match EXCHANGED {
-        [a, b] if exchanged && code == a => b,
-        [a, b] if exchanged && code == b => a,
+        [a, b] if code == a => b,
+        [a, b] if code == b => a,
         _ => code,
     };
-    of.into_iter().filter_map(|(code, subject)| Some((name(code), *places.get(&subject)?))).collect()
+    printed.iter().map(|(code, place)| (name(*code), *place)).collect()
 }
 
 /// The submaps of a recording: a function of its keyframes alone.
@@ -53,23 +40,6 @@ fn submaps(recording: &Recording) -> Vec<Submap> {
     let mut all: Vec<Submap> = closed.collect();
     all.extend(builder.flush());
     all
-}
-
-/// Where the survey puts a submap's anchor.
-fn placed(submap: &Submap, survey: &BTreeMap<u32, Vector3<f64>>) -> Option<Se3> {
-    let known = |l: &merganser_protocol::submap::landmarks::Landmark| Some((l.at, *survey.get(&l.mark.label?)?));
-    let (mut seen, mut there): (Vec<_>, Vec<_>) = submap.constellation.landmarks.iter().filter_map(known).unzip();
-    while seen.len() >= PLACED_MIN {
-        let t = upright(&fit(&seen, &there));
-        let off: Vec<f64> = seen.iter().zip(&there).map(|(p, q)| (t * *p - q).norm()).collect();
-        let worst = (0..off.len()).max_by(|&a, &b| off[a].total_cmp(&off[b]))?;
-        if off[worst] <= MISREAD {
-            return Some(t);
-        }
-        seen.remove(worst);
-        there.remove(worst);
-    }
-    None
 }
 
 /// A fit of points in a plane may turn it over.
@@ -85,8 +55,9 @@ fn off(a: &Se3, b: &Se3) -> (f64, f64) {
 }
 
 /// Distances of the landmarks of a map from the survey, after the rigid motion that fits best.
-fn errors(map: &BTreeMap<u32, Vector3<f64>>, survey: &BTreeMap<u32, Vector3<f64>>) -> Vec<(u32, f64)> {
-    let (seen, there): (Vec<_>, Vec<_>) = map.iter().filter_map(|(code, p)| Some((*p, *survey.get(code)?))).unzip();
+fn errors(map: &BTreeMap<u32, Vector3<f64>>, survey: &Survey) -> Vec<(u32, f64)> {
+    let (seen, there): (Vec<_>, Vec<_>) =
+        map.iter().filter_map(|(code, p)| Some((*p, survey.get(code)?.push(0.0)))).unzip();
     let t = upright(&fit(&seen, &there));
     let codes = map.keys().filter(|code| survey.contains_key(code));
     codes.zip(seen.iter().zip(&there)).map(|(code, (p, q))| (*code, (t * *p - q).norm())).collect()
@@ -112,7 +83,8 @@ fn agree_with_the_survey(robots: core::ops::Range<usize>, positions_min: usize) 
     let Some(data) = real_data("mrclam_dataset1") else { return };
     let out = tempfile::tempdir().unwrap();
     let recordings: Vec<Recording> = prepare(&data, out.path(), 1).unwrap().recordings.drain(robots).collect();
-    let survey = [false, true].map(|exchanged| survey(&data, exchanged));
+    let printed = survey(&data).unwrap();
+    let survey = [printed.clone(), exchanged(&printed)];
     let names: Vec<&str> = recordings.iter().map(|r| r.manifest().robot.as_str()).collect();
     let all: Vec<Vec<Submap>> = recordings.iter().map(submaps).collect();
     for ((recording, submaps), name) in recordings.iter().zip(&all).zip(&names) {

@@ -1,12 +1,13 @@
 //! Real logs, cut into robots and played through the cores: what merges, what was ever wrong, and how far off the maps
 //! are, by truths that came with the logs.
 
-mod errors;
-mod find;
-mod judge;
-mod reference;
+pub mod errors;
+pub mod find;
+pub mod judge;
+pub mod mrclam;
+pub mod reference;
 mod row;
-mod track;
+pub mod track;
 
 use super::cpu::thread_seconds;
 use crate::bar::progress_bar;

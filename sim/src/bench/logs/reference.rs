@@ -75,7 +75,7 @@ impl Reference {
             let remarks = unknown(path, all - known, all);
             Self { odometry, poses, relations: Vec::new(), remarks }
         } else {
-            let relations: Vec<Stated> = rows.iter().filter_map(|row| relation(row, &odometry)).collect();
+            let relations = relations(&rows, &odometry);
             let poses = way(&odometry, &relations).with_context(|| path.display().to_string())?;
             let remarks = unknown(path, all - relations.len(), all);
             Self { odometry, poses, relations, remarks }
@@ -175,11 +175,20 @@ fn tum(row: &[f64; 8]) -> (Stamp, Se3) {
     (stamp(seconds), planar(x, y, 2.0 * libm::atan2(qz, qw)))
 }
 
-/// A relation of two scans of the log.
-fn relation(row: &[f64; 8], odometry: &BTreeMap<Stamp, Se3>) -> Option<Stated> {
-    let [from, to, x, y, _, _, _, yaw] = *row;
-    let scan = |seconds| nearest(odometry, stamp(seconds)).map(|(stamp, _)| stamp);
-    Some(Stated { from: scan(from)?, to: scan(to)?, t_from_to: planar(x, y, yaw) })
+/// The relations of scans of the log. A log that lost its stamps has relations that name scans by their place in it,
+/// counted from 0: that is so where all that they name are whole numbers, none of which is a stamp.
+fn relations(rows: &[[f64; 8]], odometry: &BTreeMap<Stamp, Se3>) -> Vec<Stated> {
+    let stamps: Vec<Stamp> = odometry.keys().copied().collect();
+    let stamped = |seconds: f64| nearest(odometry, stamp(seconds)).map(|(stamp, _)| stamp);
+    let counted = |place: f64| stamps.get(place as usize).copied();
+    let named = || rows.iter().flat_map(|row| [row[0], row[1]]);
+    let by_place = named().all(|x| x >= 0.0 && x.fract() == 0.0) && named().all(|x| stamped(x).is_none());
+    let relation = |row: &[f64; 8]| {
+        let [from, to, x, y, _, _, _, yaw] = *row;
+        let [from, to] = [from, to].map(|name| if by_place { counted(name) } else { stamped(name) });
+        Some(Stated { from: from?, to: to?, t_from_to: planar(x, y, yaw) })
+    };
+    rows.iter().filter_map(relation).collect()
 }
 
 /// The scan of a stamp, which may be rounded differently.
@@ -192,6 +201,9 @@ pub fn nearest(odometry: &BTreeMap<Stamp, Se3>, stamp: Stamp) -> Option<(Stamp, 
 fn way(odometry: &BTreeMap<Stamp, Se3>, relations: &[Stated]) -> anyhow::Result<BTreeMap<Stamp, Se3>> {
     let named: BTreeSet<Stamp> = relations.iter().flat_map(|r| [r.from, r.to]).collect();
     let nodes: Vec<(Stamp, Se3)> = named.iter().filter_map(|stamp| Some((*stamp, *odometry.get(stamp)?))).collect();
+    if nodes.is_empty() {
+        return Err(anyhow!("no line names two scans of the log, by their stamps or by their places in it"));
+    }
     let number: BTreeMap<Stamp, u64> = nodes.iter().map(|(stamp, _)| *stamp).zip(0..).collect();
     let mut graph = PoseGraph { planar: true, ..PoseGraph::default() };
     graph.poses = nodes.iter().zip(0..).map(|((_, pose), k)| (k, Some(*pose))).collect();
@@ -233,6 +245,24 @@ fn measurement([i, j]: [u64; 2], t_i_j: Se3, (metres, heading): (f64, f64)) -> M
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn relations_name_scans_by_stamp_or_by_place() {
+        let log = |begins: f64| -> BTreeMap<Stamp, Se3> {
+            (0..9).map(|k| (stamp(begins + 0.44 * f64::from(k)), planar(f64::from(k), 0.0, 0.0))).collect()
+        };
+        let row = |from: f64, to: f64| [from, to, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+        let named = |rows: &[[f64; 8]], begins: f64| -> Vec<(Stamp, Stamp)> {
+            relations(rows, &log(begins)).iter().map(|r| (r.from, r.to)).collect()
+        };
+        let second_and_fifth = (stamp(1000.44), stamp(1001.76));
+        assert_eq!(named(&[row(1.0, 4.0), row(1.0, 90.0)], 1000.0), [second_and_fifth], "90 is beyond the log");
+        assert_eq!(named(&[row(1000.44, 1001.76)], 1000.0), [second_and_fifth]);
+        assert_eq!(named(&[row(1000.44, 1001.5)], 1000.0), []);
+        // 0 is the first stamp of this log, so 3 is none of its.
+        assert_eq!(named(&[row(0.0, 3.0)], 0.0), []);
+        assert!(way(&log(0.0), &[]).unwrap_err().to_string().contains("no line names two scans"));
+    }
 
     /// Wheels that turn too much by a tenth on a square are mended by what was checked by hand.
     #[test]
