@@ -27,8 +27,8 @@ pub(super) const SCAN_SUFFIX: &str = ".bin";
 const SCAN_NANOS: i64 = 100_000_000;
 /// A LiDAR odometry: 1 % of the way and a tenth of a degree per scan.
 const DRIFT: Drift = Drift { per_metre: 0.01, floor_m: 0.01, step_deg: 0.1 };
-/// The greatest speeds that an agent can be told to believe, m/s and °/s.
-const FASTEST: (f64, f64) = (1e4, 1e6);
+/// As fast as this a LiDAR is carried, m/s and rad/s: a dump numbers its keyframes, and does not tell their times.
+const CARRIED: (f64, f64) = (10.0, 0.5);
 /// With fewer scans than this per robot, two robots are made instead of three.
 const SCANS_PER_ROBOT_MIN: usize = 4;
 /// Submaps a robot should have at least, so that three alignments can be found.
@@ -55,9 +55,11 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
         }
     }
     let stated = poses.len();
+    let stamps: Vec<Stamp> = if graph.is_file() { carried(&poses) } else { poses.keys().map(turned).collect() };
     let scans: Vec<Scan> = poses
         .into_iter()
-        .map(|(index, truth)| Scan { stamp: Stamp(i64::from(index) * SCAN_NANOS), truth, source: source(data, index) })
+        .zip(stamps)
+        .map(|((index, truth), stamp)| Scan { stamp, truth, source: source(data, index) })
         .filter(|scan| scan.source.is_file())
         .collect();
     if scans.len() < 2 {
@@ -69,14 +71,29 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
     config.submap.sensor = Sensor::Lidar3d;
     config.submap.voxel_m = 0.5;
     config.submap.distance_m = 10.0;
-    if graph.is_file() {
-        // A dump numbers its keyframes: their times are not known, so that no speed is too fast.
-        (config.submap.speed_max_m_s, config.submap.turn_max_deg_s) = FASTEST;
-    }
     config.submap.keyframes_max = (scans.len() / (robots * SUBMAPS_PER_ROBOT)).clamp(1, 10) as u32;
     let origin = format!("{} LiDAR scans ({stated} poses) cut into {robots} robots by time", scans.len());
     let cut = Cut { robots, sensor: "lidar3d", origin, drift: DRIFT, seed, config };
     cut.write(&scans, out, |scan| cloud::read(&scan.source, format))
+}
+
+/// When a LiDAR made the scan of this number.
+fn turned(number: &u32) -> Stamp {
+    Stamp(i64::from(*number) * SCAN_NANOS)
+}
+
+/// When the keyframes of a dump were made, had the LiDAR been carried as fast as it is at most.
+fn carried(poses: &BTreeMap<u32, Se3>) -> Vec<Stamp> {
+    let (mut now, mut last) = (0_i64, None);
+    let mut stamp = |pose: &Se3| {
+        if let Some(last) = last.replace(*pose) {
+            let t_last_this = last.inverse() * *pose;
+            let secs = (t_last_this.translation.norm() / CARRIED.0).max(t_last_this.rotation.angle() / CARRIED.1);
+            now = now.saturating_add(SCAN_NANOS.max((secs * 1e9).ceil() as i64));
+        }
+        Stamp(now)
+    };
+    poses.values().map(&mut stamp).collect()
 }
 
 /// Numbers of the scans in a folder: files `NNNNNN.bin`, or folders `NNNNNN` with points.

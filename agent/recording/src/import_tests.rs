@@ -4,6 +4,7 @@
 use super::Recording;
 use super::error::RecordingError;
 use super::import::{Kind, detect, prepare};
+use merganser_protocol::submap::SubmapBuilder;
 use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::io::Write as _;
@@ -171,6 +172,29 @@ fn lidar_scans_become_three_robots_or_two() {
     let (_, recordings, _out) =
         imported(kitti, |d| (10..14).for_each(|k| fs::remove_file(d.join(format!("{k:06}.bin"))).unwrap())).unwrap();
     assert_eq!(robots(&recordings), [("alpha", 5), ("beta", 5)]);
+}
+
+/// Keyframes of a SLAM, 12 m apart.
+fn dump(data: &Path) {
+    let mut graph = String::new();
+    for k in 0..6 {
+        let folder = data.join(format!("{k:06}"));
+        fs::create_dir(&folder).unwrap();
+        let points = (0..40).flat_map(|n| [5.0, n as f32 - 20.0, 0.1 * n as f32]);
+        fs::write(folder.join("points.bin"), points.flat_map(f32::to_le_bytes).collect::<Vec<u8>>()).unwrap();
+        let _ = writeln!(graph, "v{k} {} 0 0 0 0 0 1", 12 * k);
+    }
+    fs::write(data.join("graph.txt"), graph).unwrap();
+}
+
+#[test]
+fn keyframes_of_a_dump_have_the_time_that_their_way_takes() {
+    let (_, recordings, _out) = imported(dump, |_| {}).unwrap();
+    assert_eq!(robots(&recordings), [("alpha", 3), ("beta", 3)]);
+    for recording in &recordings {
+        let mut builder = SubmapBuilder::new(recording.manifest().config.submap.clone());
+        (0..recording.len()).for_each(|k| drop(builder.push(recording.keyframe(k).unwrap()).unwrap()));
+    }
 }
 
 #[test]
