@@ -18,7 +18,7 @@ pub const CHANNELS: [Channel; 3] = [Channel::Pose, Channel::Facts, Channel::Have
 /// All questions between robots.
 pub const QUERIES: [QueryKind; 3] = [QueryKind::Sync, QueryKind::Blob, QueryKind::Align];
 /// All views, as in `…/view/{name}`.
-pub const VIEWS: [&str; 6] = ["status", "frames", "poses", "map", "graph", "stats"];
+pub const VIEWS: [&str; 7] = ["status", "frames", "poses", "map", "path", "graph", "stats"];
 /// Last part of a robot's liveliness key.
 pub const ALIVE: &str = "alive";
 /// What a robot's own SLAM sends.

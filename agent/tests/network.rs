@@ -238,7 +238,7 @@ async fn views_are_published_as_json_while_somebody_subscribes() {
         names.push(reply.result().unwrap().key_expr().as_str().rsplit('/').next().unwrap().to_string());
     }
     names.sort();
-    assert_eq!(names, ["frames", "graph", "map", "poses", "stats", "status"]);
+    assert_eq!(names, ["frames", "graph", "map", "path", "poses", "stats", "status"]);
     drop(samples);
     session::close(&session, PATIENCE).await;
     alpha.stop().await.unwrap();

@@ -1,8 +1,12 @@
 //! The debug view: what an agent believes, as plain serialisable values. Shells publish each view as JSON under
-//! `…/view/{status,frames,poses,map,graph,stats}`, so that any subscriber in any language can read the swarm's state.
+//! `…/view/{status,frames,poses,map,path,graph,stats}`, so that any subscriber in any language can read the swarm's state.
 //!
 //! Poses are `{translation: [x, y, z], rotation: [x, y, z, w], scale}`; covariances are the row-major upper triangle of
 //! the local perturbation's covariance in the order (ρ, φ[, λ]): 21 numbers for a rigid pose, 28 for a similarity.
+
+mod path;
+
+pub use path::{KeyframeView, PathView, bodies};
 
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
 pub use crate::kinds::{Optimality, PairStatus};
@@ -24,6 +28,8 @@ pub struct Snapshot {
     pub poses: PosesView,
     /// Submap anchors.
     pub map: MapView,
+    /// This robot's keyframes.
+    pub path: PathView,
     /// The factor graph.
     pub graph: GraphView,
     /// Counters.
@@ -188,6 +194,11 @@ pub struct RobotView {
     pub anchor: String,
     /// `t_own_body`, if its frame is connected to ours.
     pub t_own_body: Option<RelationView>,
+    /// Of this robot alone: t_own_body ∘ t_odom_body⁻¹ of its last keyframe, where *odom* is the frame of the poses
+    /// that its SLAM sends; REP 105's `map` → `odom`, with our own frame as map. Composed with a pose in odom it has
+    /// again the covariance of [`Self::t_own_body`]; at the origin of odom it is as uncertain as the way there.
+    #[serde(default)]
+    pub t_map_odom: Option<RelationView>,
 }
 
 /// `view/map`.

@@ -223,11 +223,9 @@ fn others<'a>(tracks: &'a [Track], name: &'a str) -> impl Iterator<Item = &'a st
 pub fn evaluate(tracks: &[Track], views: &[Views], bounds: &Bounds) -> Evaluation {
     let pairs = pairs(tracks, views);
     let corrected: Vec<Option<Corrected>> = match views.first() {
-        Some(reference) => tracks
-            .iter()
-            .zip(views)
-            .map(|(track, own)| trajectory::correct(track, reference, &own.frames.own))
-            .collect(),
+        Some(reference) => {
+            tracks.iter().zip(views).map(|(track, own)| trajectory::correct(track, reference, own)).collect()
+        }
         None => Vec::new(),
     };
     let trajectory = trajectory::errors(tracks, &corrected);
@@ -263,7 +261,7 @@ fn singles(tracks: &[Track], views: &[Views]) -> Singles {
     let t_world_anchor = |submap: &str| {
         let (frame, _) = submap.rsplit_once('#')?;
         let robot = views.iter().position(|views| views.frames.own == frame)?;
-        trajectory::true_anchor(tracks.get(robot)?, reference, submap)
+        trajectory::true_anchor(tracks.get(robot)?, &views[robot], submap)
     };
     let used = reference.graph.edges.iter().filter(|edge| edge.kind == "alignment" && edge.weight > 0.0);
     let mut singles = Singles::default();

@@ -8,8 +8,8 @@ use super::*;
 use crate::recording::{Drift, Writer, cloud};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3};
 use merganser_protocol::snapshot::{
-    EdgeView, FrameView, FramesView, GraphView, MapView, PairStatus, PairView, PoseView, RelationView, StatsView,
-    StatusView, SubmapView,
+    EdgeView, FrameView, FramesView, GraphView, KeyframeView, MapView, PairStatus, PairView, PathView, PoseView,
+    RelationView, StatsView, StatusView, SubmapView,
 };
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::Stamp;
@@ -125,6 +125,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
             pairs: vec![pair(0, 1), pair(0, 2), pair(1, 2)],
         },
         map: MapView { submaps: (0..3).flat_map(|r| (0..3).map(move |i| (r, i))).map(|(r, i)| submap(r, i)).collect() },
+        path: path(tracks, own, |k| tracks[own].odometry[k]),
         graph: GraphView {
             nodes: 9,
             chi2: 1.0,
@@ -142,6 +143,18 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
         },
         stats: StatsView { sent_bytes: BTreeMap::from([("facts".into(), 12_345)]), ..StatsView::default() },
     }
+}
+
+/// What a robot shows of its keyframes if its scans put them there.
+fn path(tracks: &[Track], own: usize, t_frame_body: impl Fn(usize) -> Se3) -> PathView {
+    let track = &tracks[own];
+    let keyframe = |k: usize| KeyframeView {
+        stamp_secs: track.stamps_secs[k],
+        submap: (k / PER_SUBMAP) as u32,
+        t_odom_body: PoseView::from(&track.odometry[k]),
+        t_frame_body: PoseView::from(&t_frame_body(k)),
+    };
+    PathView { frame: frame(own), keyframes: (0..KEYFRAMES).map(keyframe).collect(), forgotten: 0 }
 }
 
 pub(super) fn all_views(tracks: &[Track], error: &Vector6<f64>) -> Vec<Views> {
@@ -206,6 +219,44 @@ fn a_true_map_passes_every_check() {
         assert!(truth.local(&corrected.poses[first].to_se3()).norm() < 1e-9);
     }
     assert_eq!(corrected.anchors.len(), 3);
+}
+
+/// Scans correct the odometry, so that anchors lie on another way than the poses that the SLAM sent: hung from anchors,
+/// those would be off by all that was corrected.
+#[test]
+fn paths_are_those_that_anchors_lie_on() {
+    let tracks = tracks();
+    let mut views = all_views(&tracks, &Vector6::zeros());
+    let t_world = |robot: usize| tracks[robot].t_world_frame().unwrap().to_se3();
+    for (own, track) in tracks.iter().enumerate() {
+        let right = |k: usize| t_world(own).inverse() * track.truth.as_ref().unwrap()[k];
+        views[own].path = path(&tracks, own, right);
+        for submap in views.iter_mut().flat_map(|views| &mut views.map.submaps) {
+            if submap.frame == frame(own) {
+                submap.t_frame_anchor = PoseView::from(&right(submap.index as usize * PER_SUBMAP));
+            }
+        }
+    }
+    // A keyframe that was refused goes on by odometry.
+    let lost = views[1].path.keyframes.remove(PER_SUBMAP + 2);
+    let evaluation = evaluate(&tracks, &views, &BOUNDS);
+    let t_ref_world = t_world(0).inverse();
+    for (robot, track) in tracks.iter().enumerate() {
+        let corrected = evaluation.corrected[robot].as_ref().unwrap();
+        for (k, body) in corrected.poses.iter().enumerate() {
+            let truth = t_ref_world * track.truth.as_ref().unwrap()[k];
+            let off = truth.local(&body.to_se3()).norm();
+            if track.stamps_secs[k] != lost.stamp_secs || robot != 1 {
+                assert!(off < 1e-9, "{robot} {k}: {off}");
+            } else {
+                let before = track.truth.as_ref().unwrap()[k - 1];
+                let step = track.odometry[k - 1].inverse() * track.odometry[k];
+                assert!((t_ref_world * before * step).local(&body.to_se3()).norm() < 1e-9 && off > 1e-3, "{off}");
+            }
+        }
+    }
+    // The alignment is judged by where its anchors truly are, too.
+    assert!(evaluation.singles.count == 1 && evaluation.singles.nees_mean < 1e-9, "{:?}", evaluation.singles);
 }
 
 #[test]

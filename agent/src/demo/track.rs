@@ -51,14 +51,9 @@ impl Track {
     /// `t_world_frame`: where the robot's local frame truly lies, and what its unit is, m. A frame is defined by its
     /// first keyframe, where the odometry has not drifted yet. `None` without truth or unit.
     pub fn t_world_frame(&self) -> Option<Sim3> {
-        self.t_world_frame_at(0)
-    }
-
-    /// Where the frame would lie if the odometry were right at this keyframe.
-    pub fn t_world_frame_at(&self, keyframe: usize) -> Option<Sim3> {
         let unit = Sim3::new(So3::identity(), Vector3::zeros(), self.unit_m?);
-        let t_world_body = Sim3::from_se3(self.truth.as_ref()?.get(keyframe)?);
-        Some(t_world_body * unit * Sim3::from_se3(&self.odometry.get(keyframe)?.inverse()))
+        let t_world_body = Sim3::from_se3(self.truth.as_ref()?.first()?);
+        Some(t_world_body * unit * Sim3::from_se3(&self.odometry.first()?.inverse()))
     }
 }
 

@@ -1,12 +1,12 @@
 //! The robots' paths after merging, in one frame, and their errors.
 
 use super::track::Track;
-use super::views::{Views, pose, relative};
+use super::views::{Views, bodies, pose, relative};
 use merganser_protocol::geometry::{Relative, Se3, Sim3, So3};
 use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::{Matrix3, Vector3};
 
-/// A keyframe belongs to a submap if its stamp lies in the submap's span, widened by this (stamps travel as floats), s.
+/// Stamps are one if they differ by no more than this, s: they travel as floats.
 const STAMP_SLACK_SECS: f64 = 1e-6;
 
 /// One robot's path in the frame of the reference robot.
@@ -18,41 +18,43 @@ pub struct Corrected {
     pub anchors: Vec<Relative>,
 }
 
-/// Moves a robot's odometry along with its submaps: t_ref_body = t_ref_anchor ∘ t_frame_anchor⁻¹ ∘ t_frame_body with
-/// the anchor of the submap that the keyframe belongs to. `None` if the reference robot does not know where `frame`
-/// lies.
-pub fn correct(track: &Track, reference: &Views, frame: &str) -> Option<Corrected> {
-    let mut submaps: Vec<_> = reference.map.submaps.iter().filter(|submap| submap.frame == frame).collect();
+/// A robot's keyframes in the frame of the reference robot: where [`bodies`] has them, by what the robot itself says of
+/// its path. A keyframe that the robot knows nothing of, as it refused it or forgot it, goes on by odometry from the last
+/// one before it that it knows. `None` if the reference robot does not know where the robot's frame lies.
+pub fn correct(track: &Track, reference: &Views, own: &Views) -> Option<Corrected> {
+    let frame = &own.frames.own;
+    let mut submaps: Vec<_> = reference.map.submaps.iter().filter(|submap| submap.frame == *frame).collect();
     submaps.sort_by_key(|submap| submap.index);
-    let mut moves = Vec::new();
-    let mut anchors = Vec::new();
-    for submap in submaps {
-        let t_ref_anchor = relative(submap.t_own_anchor.as_ref()?)?;
-        let t_anchor_frame = Sim3::from_se3(&pose(&submap.t_frame_anchor)?.inverse());
-        moves.push((submap.stamps_secs[0], t_ref_anchor.sim() * t_anchor_frame));
-        anchors.push(t_ref_anchor);
-    }
-    let first = moves.first()?.1;
-    let poses = track.stamps_secs.iter().zip(&track.odometry).map(|(stamp, t_frame_body)| {
-        let begun = moves.iter().take_while(|(start, _)| *start <= stamp + STAMP_SLACK_SECS);
-        begun.last().map_or(first, |(_, t_ref_frame)| *t_ref_frame) * Sim3::from_se3(t_frame_body)
+    let anchors: Option<Vec<Relative>> = submaps.iter().map(|submap| relative(submap.t_own_anchor.as_ref()?)).collect();
+    let known: Vec<(f64, Sim3, Se3)> = (own.path.keyframes.iter().zip(bodies(&own.path, &reference.map)))
+        .filter_map(|(keyframe, body)| Some((keyframe.stamp_secs, body?, pose(&keyframe.t_odom_body)?)))
+        .collect();
+    let first = known.first()?;
+    let poses = track.stamps_secs.iter().zip(&track.odometry).map(|(stamp, t_odom_body)| {
+        let until = known.partition_point(|(at, ..)| *at <= stamp + STAMP_SLACK_SECS);
+        let (_, t_ref_known, t_odom_known) = until.checked_sub(1).map_or(first, |k| &known[k]);
+        *t_ref_known * Sim3::from_se3(&(t_odom_known.inverse() * *t_odom_body))
     });
-    Some(Corrected { poses: poses.collect(), anchors })
+    Some(Corrected { poses: poses.collect(), anchors: anchors? })
 }
 
-/// True `t_world_anchor` of a submap, `name/epoch#index`: the anchor moves with the keyframe it was placed at, the one
-/// of the submap's span whose odometry is the anchor's.
-pub fn true_anchor(track: &Track, views: &Views, submap: &str) -> Option<Sim3> {
+/// True `t_world_anchor` of a submap, `name/epoch#index`, of the robot of `track`, whose views are `own`: the anchor
+/// moves with the keyframe of the submap that is nearest to it.
+pub fn true_anchor(track: &Track, own: &Views, submap: &str) -> Option<Sim3> {
     let (frame, index) = submap.rsplit_once('#')?;
     let index: u32 = index.parse().ok()?;
-    let view = views.map.submaps.iter().find(|view| view.frame == frame && view.index == index)?;
-    let t_frame_anchor = pose(&view.t_frame_anchor)?;
-    let [begin, end] = view.stamps_secs;
-    let span = (begin - STAMP_SLACK_SECS)..=(end + STAMP_SLACK_SECS);
-    let inside = (0..track.odometry.len()).filter(|&k| span.contains(&track.stamps_secs[k]));
-    let away = |k: usize| t_frame_anchor.local(&track.odometry[k]).norm();
-    let at = inside.min_by(|&a, &b| away(a).total_cmp(&away(b)))?;
-    Some(track.t_world_frame_at(at)? * Sim3::from_se3(&t_frame_anchor))
+    let view = own.map.submaps.iter().find(|view| view.frame == frame && view.index == index)?;
+    let t_anchor_frame = pose(&view.t_frame_anchor)?.inverse();
+    let keyframes = own.path.keyframes.iter().filter(|keyframe| own.path.frame == frame && keyframe.submap == index);
+    let within = keyframes.filter_map(|keyframe| {
+        let near = |k: &usize| (track.stamps_secs[*k] - keyframe.stamp_secs).abs() <= STAMP_SLACK_SECS;
+        let k = (0..track.stamps_secs.len()).find(near)?;
+        Some((k, t_anchor_frame * pose(&keyframe.t_frame_body)?))
+    });
+    let (k, t_anchor_body) = within.min_by(|(_, a), (_, b)| a.log().norm().total_cmp(&b.log().norm()))?;
+    let unit = Sim3::new(So3::identity(), Vector3::zeros(), track.unit_m?);
+    let t_world_body = Sim3::from_se3(track.truth.as_ref()?.get(k)?);
+    Some(t_world_body * unit * Sim3::from_se3(&t_anchor_body.inverse()))
 }
 
 /// Root mean square errors of keyframe positions, m.

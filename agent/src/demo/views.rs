@@ -1,11 +1,11 @@
 //! The views of one robot as they are read off Zenoh, and poses out of them.
 
 use merganser_protocol::geometry::Relative;
-use merganser_protocol::snapshot::{FramesView, GraphView, MapView, PairView, StatsView, StatusView};
+use merganser_protocol::snapshot::{FramesView, GraphView, MapView, PairView, PathView, StatsView, StatusView};
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 
-pub use merganser_protocol::snapshot::{pose, relation, relative};
+pub use merganser_protocol::snapshot::{bodies, pose, relation, relative};
 
 /// What one robot showed at one moment.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,6 +16,8 @@ pub struct Views {
     pub frames: FramesView,
     /// Anchors.
     pub map: MapView,
+    /// Its keyframes.
+    pub path: PathView,
     /// Alignments.
     pub graph: GraphView,
     /// Counters.
@@ -36,6 +38,7 @@ impl Views {
             status: view(documents, "status")?,
             frames: view(documents, "frames")?,
             map: view(documents, "map")?,
+            path: view(documents, "path")?,
             graph: view(documents, "graph")?,
             stats: view(documents, "stats")?,
         })

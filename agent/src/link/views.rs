@@ -1,6 +1,6 @@
 //! What the agent shows: its views as JSON, for whoever asks, and published while somebody subscribes. One snapshot
-//! serves all that ask within a short time, so that asking cannot slow the core down. The map, which alone may take
-//! many megabytes, is made only for those who want it.
+//! serves all that ask within a short time, so that asking cannot slow the core down. Map and path, which
+//! alone may take megabytes, are made only for those who want them.
 
 use super::session::LinkError;
 use super::{Shared, refused};
@@ -18,8 +18,8 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Query;
 
-/// The view that grows with the map.
-const MAP: &str = "map";
+/// The views that grow with the map and the way.
+const LARGE: [&str; 2] = ["map", "path"];
 /// Questions that may wait.
 const WAITING_MAX: usize = 32;
 /// A snapshot serves for this long.
@@ -31,7 +31,7 @@ const REPEAT: Duration = Duration::from_secs(5);
 pub type Views = BTreeMap<&'static str, Vec<u8>>;
 
 /// Views of a snapshot as JSON, a document for each. `shell` are the agent's own counters, shown in `stats`.
-pub fn render(snapshot: &Snapshot, map: bool, shell: &BTreeMap<String, u64>) -> serde_json::Result<Views> {
+pub fn render(snapshot: &Snapshot, large: bool, shell: &BTreeMap<String, u64>) -> serde_json::Result<Views> {
     let mut stats = serde_json::to_value(&snapshot.stats)?;
     stats["shell"] = serde_json::to_value(shell)?;
     let mut views = BTreeMap::from([
@@ -41,8 +41,9 @@ pub fn render(snapshot: &Snapshot, map: bool, shell: &BTreeMap<String, u64>) -> 
         ("graph", serde_json::to_vec(&snapshot.graph)?),
         ("stats", serde_json::to_vec(&stats)?),
     ]);
-    if map {
-        views.insert(MAP, serde_json::to_vec(&snapshot.map)?);
+    if large {
+        views.insert("map", serde_json::to_vec(&snapshot.map)?);
+        views.insert("path", serde_json::to_vec(&snapshot.path)?);
     }
     Ok(views)
 }
@@ -119,7 +120,7 @@ impl Server {
             zenoh::key_expr::KeyExpr::new(key.as_str()).is_ok_and(|key| question.key_expr().intersects(&key))
         };
         let wanted: Vec<&str> = keys::VIEWS.into_iter().filter(asked).collect();
-        let views = self.views(wanted.contains(&MAP)).await?;
+        let views = self.views(wanted.iter().any(|view| LARGE.contains(view))).await?;
         for view in wanted {
             let (key, json) = (self.shared.own(&format!("view/{view}")), views[view].clone());
             self.shared.reply(question.clone(), key, json, keys::view_encoding(view));
@@ -138,7 +139,7 @@ impl Server {
         if wanted.is_empty() {
             return Some(());
         }
-        let views = self.views(wanted.contains(&MAP)).await?;
+        let views = self.views(wanted.iter().any(|view| LARGE.contains(view))).await?;
         for view in wanted {
             self.publish_one(view, &views[view]).await;
         }
@@ -163,15 +164,16 @@ impl Server {
         self.published.insert(view, (now, json.to_vec()));
     }
 
-    /// The views of a moment that has just been, with the map if it is wanted.
-    async fn views(&mut self, map: bool) -> Option<Arc<Views>> {
-        let serves =
-            |(when, views): &&(Instant, Arc<Views>)| when.elapsed() < FRESH && (views.contains_key(MAP) || !map);
+    /// The views of a moment that has just been, with the large ones if they are wanted.
+    async fn views(&mut self, large: bool) -> Option<Arc<Views>> {
+        let serves = |(when, views): &&(Instant, Arc<Views>)| {
+            when.elapsed() < FRESH && (!large || LARGE.iter().all(|view| views.contains_key(view)))
+        };
         if let Some((_, views)) = self.last.as_ref().filter(serves) {
             return Some(views.clone());
         }
-        let snapshot = if map { self.snapshots.take().await? } else { self.snapshots.overview().await? };
-        let rendered = render(&snapshot, map, &self.shared.drops().counts());
+        let snapshot = if large { self.snapshots.take().await? } else { self.snapshots.overview().await? };
+        let rendered = render(&snapshot, large, &self.shared.drops().counts());
         let views = Arc::new(rendered.unwrap_or_else(|reason| {
             tracing::error!(%reason, "a view cannot be written as JSON; this is a bug");
             keys::VIEWS.iter().map(|view| (*view, b"null".to_vec())).collect()

@@ -2,7 +2,7 @@
 //! otherwise, and how far two measurements of one thing lie apart (DESIGN §7).
 
 use super::chi2;
-use super::{PoseWithCovariance, Sim3, SimWithCovariance};
+use super::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance};
 
 /// A relative measurement or estimate between two frames or submaps: rigid where both have metric scale.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -83,6 +83,24 @@ impl Relative {
         }
     }
 
+    /// `self ∘ t` for a pose that is exactly known: `Σ = Ad(t⁻¹) Σ_self Ad(t⁻¹)ᵀ`.
+    #[must_use]
+    pub fn onto(&self, t: &Se3) -> Self {
+        match self {
+            Self::Metric(p) => {
+                let a = t.inverse().adjoint();
+                let covariance = Covariance::new_or_wider(a * p.covariance.matrix() * a.transpose());
+                Self::Metric(PoseWithCovariance { pose: p.pose * *t, covariance })
+            }
+            Self::Similarity(s) => {
+                let t = Sim3::from_se3(t);
+                let a = t.inverse().adjoint();
+                let covariance = Covariance::new_or_wider(a * s.covariance.matrix() * a.transpose());
+                Self::Similarity(SimWithCovariance { sim: s.sim * t, covariance })
+            }
+        }
+    }
+
     /// The inverse.
     #[must_use]
     pub fn inverse(&self) -> Self {
@@ -109,7 +127,6 @@ impl Relative {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Covariance;
     use crate::sampling::{covariance, draw, pose, rng, similarity};
     use crate::sim3::Vector7;
 
@@ -125,6 +142,28 @@ mod tests {
         assert!(m.disagreement(&m).distance_squared < 1e-20);
         assert_eq!(m.disagreement(&m).degrees_of_freedom, 6);
         assert_eq!(m.disagreement(&s).degrees_of_freedom, 7);
+    }
+
+    #[test]
+    fn an_exact_pose_moves_the_covariance_there_and_back() {
+        let mut rng = rng(14);
+        for _ in 0..20 {
+            let m = Relative::Metric(PoseWithCovariance { pose: pose(&mut rng), covariance: covariance(&mut rng) });
+            let s =
+                Relative::Similarity(SimWithCovariance { sim: similarity(&mut rng), covariance: covariance(&mut rng) });
+            let t = pose(&mut rng);
+            for one in [m, s] {
+                let (there, back) = (one.onto(&t), one.onto(&t).onto(&t.inverse()));
+                // As with a pose that is known to a millionth.
+                let exact = PoseWithCovariance { pose: t, covariance: Covariance::from_sigmas([1e-6; 6]).unwrap() };
+                let composed = one.compose(&Relative::Metric(exact)).lifted();
+                assert!(there.sim().local(&composed.sim).norm() < 1e-9);
+                let (a, b) = (there.lifted().covariance, composed.covariance);
+                assert!((a.matrix() - b.matrix()).amax() < 1e-6 * b.matrix().amax());
+                let (a, b) = (back.lifted().covariance, one.lifted().covariance);
+                assert!((a.matrix() - b.matrix()).amax() < 1e-9 * b.matrix().amax());
+            }
+        }
     }
 
     #[test]

@@ -11,8 +11,8 @@ use crate::estimate::solve::ComponentError;
 use crate::geometry::Se3;
 use crate::ids::{EntryId, FrameId, RobotId};
 use crate::snapshot::{
-    CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, MiddleView, PairView, PoseView,
-    PosesView, RelationView, Snapshot, StatsView, StatusView, SubmapView,
+    CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, MiddleView, PairView, PathView,
+    PoseView, PosesView, RelationView, Snapshot, StatsView, StatusView, SubmapView,
 };
 use crate::time::Instant;
 use crate::wire::fact::AlignmentFact;
@@ -21,16 +21,18 @@ use std::collections::{BTreeMap, BTreeSet};
 impl Agent {
     /// Everything this agent believes at `now`.
     pub fn snapshot(&self, now: Instant) -> Snapshot {
-        Snapshot { map: self.map_view(), ..self.overview(now) }
+        let path = self.mapping.path_view(self.context.frame_name(self.context.frame()));
+        Snapshot { map: self.map_view(), path, ..self.overview(now) }
     }
 
-    /// [`Agent::snapshot`] with an empty map: the map of a large swarm has tens of thousands of anchors.
+    /// [`Agent::snapshot`] with an empty map and path: the map of a large swarm has tens of thousands of anchors.
     pub fn overview(&self, now: Instant) -> Snapshot {
         Snapshot {
             status: self.status(),
             frames: self.frames(),
             poses: self.poses_view(now),
             map: MapView { submaps: Vec::new() },
+            path: PathView::default(),
             graph: self.graph_view(),
             stats: self.stats_view(),
         }
@@ -147,7 +149,10 @@ impl Agent {
 
     fn poses_view(&self, now: Instant) -> PosesView {
         let live = live_robots(&self.context, self.mapping.body(), self.replication.beacons(), now);
-        let robots = live.iter().map(|one| robot_view(&self.context, &self.estimation, one)).collect();
+        // This robot stands first, if it is among them.
+        let t_odom_body = |k: usize| self.mapping.t_odom_body().filter(|_| k == 0 && self.mapping.body().is_some());
+        let view = |(k, one)| robot_view(&self.context, &self.estimation, one, t_odom_body(k));
+        let robots = live.iter().enumerate().map(view).collect();
         PosesView { robots, pairs: pair_views(&self.context, &self.estimation, &live) }
     }
 

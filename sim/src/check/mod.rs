@@ -179,7 +179,7 @@ pub(crate) mod tests {
     use super::*;
     use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
     use merganser_protocol::snapshot::{
-        FrameView, FramesView, GraphView, MapView, PosesView, RelationView, StatsView, StatusView,
+        FrameView, FramesView, GraphView, MapView, PathView, PosesView, RelationView, StatsView, StatusView,
     };
 
     /// A relation with the same standard deviation in all six directions.
@@ -221,6 +221,7 @@ pub(crate) mod tests {
             frames,
             poses: PosesView::default(),
             map: MapView { submaps: Vec::new() },
+            path: PathView::default(),
             graph: GraphView::default(),
             stats: StatsView::default(),
         };

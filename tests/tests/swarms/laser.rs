@@ -1,12 +1,12 @@
 //! Three planar robots on a real laser log (Radish `aces`), through the importer and the cores on perfect wires: they
 //! merge, nothing false is used, and the merged map explains the relations that people checked by hand.
 
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use merganser::demo::views::{pose, relation};
 use merganser::recording::Recording;
 use merganser::recording::import::prepare;
-use merganser_protocol::geometry::{Se3, So3};
-use merganser_protocol::snapshot::{EdgeView, Snapshot};
-use merganser_protocol::submap::SubmapBuilder;
+use merganser_protocol::geometry::{Relative, Se3, So3};
+use merganser_protocol::snapshot::{EdgeView, MapView, PathView, Snapshot, bodies};
 use merganser_tests::real_data;
 use merganser_tests::wires::play;
 use nalgebra::Vector3;
@@ -23,6 +23,13 @@ const FALSE: (f64, f64) = (1.0, 8.0);
 const TURN_MAX: f64 = 0.05;
 /// One that takes longer than this to the next keyframe rests on the way, nobody knows where.
 const PAUSE_MAX_NANOS: i64 = 2_000_000_000;
+/// Clouds are thinned to a point in squares of this size, m...
+const CELL_M: f64 = 0.1;
+/// ...points of two robots agree as those of one, but for so much: they did not see all the same things...
+const AGREE: f64 = 1.5;
+/// ...and points of two robots are of one thing if no farther apart, and seen from one place if the bodies were no
+/// farther apart, m.
+const SAME_M: f64 = 1.0;
 /// Relations over more than this time are loops, s.
 const LOOP_SECS: f64 = 20.0;
 
@@ -36,22 +43,16 @@ struct Way {
 }
 
 impl Way {
-    /// Drives the recording once more: where each keyframe is in its submap is a function of the keyframes alone.
-    fn of(recording: &Recording, anchors: &BTreeMap<u32, Se3>) -> Self {
-        let mut builder = SubmapBuilder::new(recording.manifest().config.submap.clone());
-        let mut way = Self { stamps: Vec::new(), raw: Vec::new(), mapped: Vec::new() };
-        for index in 0..recording.len() {
-            let keyframe = recording.keyframe(index).unwrap();
-            way.stamps.push(keyframe.stamp.0);
-            way.raw.push(keyframe.pose.pose);
-            let closed = builder.push(keyframe).unwrap();
-            let closed = closed.or_else(|| (index + 1 == recording.len()).then(|| builder.flush()).flatten());
-            if let Some(submap) = closed {
-                let anchor = anchors.get(&submap.index);
-                way.mapped.extend(submap.keyframes.iter().map(|t_anchor_body| Some(*anchor? * *t_anchor_body)));
-            }
-        }
-        assert_eq!(way.mapped.len(), way.raw.len());
+    /// A robot's own path on the map of another.
+    fn of(recording: &Recording, path: &PathView, map: &MapView) -> Self {
+        let way = Self {
+            stamps: recording.keyframes().iter().map(|line| line.stamp.0).collect(),
+            raw: recording.keyframes().iter().map(|line| line.pose.pose).collect(),
+            mapped: bodies(path, map).iter().map(|body| body.map(|body| body.to_se3())).collect(),
+        };
+        assert_eq!((way.mapped.len(), path.forgotten), (way.raw.len(), 0));
+        let odom: Vec<Se3> = path.keyframes.iter().map(|keyframe| pose(&keyframe.t_odom_body).unwrap()).collect();
+        assert!(odom.iter().zip(&way.raw).all(|(a, b)| a.local(b).norm() < 1e-9));
         way
     }
 
@@ -73,6 +74,77 @@ impl Way {
 fn off(a: &Se3, b: &Se3) -> (f64, f64) {
     let between = a.inverse() * *b;
     (between.translation.xy().norm(), between.rotation.angle().to_degrees())
+}
+
+/// An anchor is where the middle keyframe of its submap is.
+fn passes_through(way: &Way, path: &PathView, anchors: &BTreeMap<u32, Se3>) {
+    for (index, anchor) in anchors {
+        let within = || (0..path.keyframes.len()).filter(|&k| path.keyframes[k].submap == *index);
+        let away = |at: Se3| anchor.local(&at).norm();
+        let nearest = within().map(|k| away(way.mapped[k].unwrap())).fold(f64::INFINITY, f64::min);
+        assert!(nearest < 1e-6, "the path passes {nearest} from anchor {index}");
+    }
+}
+
+/// `t_map_odom` maps what the SLAM says to where the robot is, as surely as that is known; and it moves while odometry
+/// drifts.
+fn is_tied(way: &Way, own: &Snapshot) {
+    let live = own.poses.robots.first().unwrap();
+    assert_eq!(live.robot, own.status.robot);
+    assert!(own.poses.robots[1..].iter().all(|other| other.t_map_odom.is_none()));
+    let t_map_odom = live.t_map_odom.as_ref().and_then(relation).unwrap();
+    let t_own_body = live.t_own_body.as_ref().and_then(relation).unwrap();
+    let back = Relative::Metric(t_map_odom).onto(way.raw.last().unwrap());
+    let back = back.metric().unwrap();
+    assert!(back.pose.local(&t_own_body.pose).norm() < 1e-6);
+    let covariance = t_own_body.covariance.matrix();
+    assert!((back.covariance.matrix() - covariance).amax() < 1e-5 * covariance.amax());
+    let first = bodies(&own.path, &own.map)[0].unwrap().to_se3() * way.raw[0].inverse();
+    let (metres, degrees) = off(&first, &t_map_odom.pose);
+    println!("{}: map to odom moved by {metres:.2} m, {degrees:.1}°", live.robot);
+    assert!(metres > 0.5 || degrees > 3.0, "wheels drift");
+}
+
+/// A point in each square of [`CELL_M`] that these keyframes saw.
+fn cloud(recording: &Recording, poses: &[Option<Se3>], keyframes: impl Iterator<Item = usize>) -> Vec<[f64; 2]> {
+    let mut taken: BTreeMap<[i64; 2], [f64; 2]> = BTreeMap::new();
+    for k in keyframes {
+        for point in recording.points(k).unwrap() {
+            let p = poses[k].unwrap() * Vector3::from(point.map(f64::from));
+            taken.entry([p.x, p.y].map(|x| (x / CELL_M).floor() as i64)).or_insert([p.x, p.y]);
+        }
+    }
+    taken.into_values().collect()
+}
+
+/// Two robots' points agree, of what the second saw from where the first was, too, about as well as those of every other keyframe of one robot. Where
+/// raw odometry hangs from the first anchors, they do not.
+fn clouds_agree(recordings: [&Recording; 2], ways: [&Way; 2]) {
+    let raw = |way: &Way| -> Vec<Option<Se3>> {
+        let t_map_odom = way.mapped[0].unwrap() * way.raw[0].inverse();
+        way.raw.iter().map(|t_odom_body| Some(t_map_odom * *t_odom_body)).collect()
+    };
+    let at = |r: usize, k: usize| ways[r].mapped[k].unwrap().translation;
+    let is_shared = |k: &usize| (0..ways[0].mapped.len()).any(|of| (at(0, of) - at(1, *k)).norm() < SAME_M);
+    let shared: Vec<usize> = (0..ways[1].mapped.len()).filter(is_shared).collect();
+    let of_two = |poses: [&[Option<Se3>]; 2]| {
+        let whole = cloud(recordings[0], poses[0], 0..poses[0].len());
+        mean_nearest(&[whole, cloud(recordings[1], poses[1], shared.iter().copied())])
+    };
+    let half = |from: usize| cloud(recordings[0], &ways[0].mapped, (from..ways[0].mapped.len()).step_by(2));
+    let merged = of_two([&ways[0].mapped, &ways[1].mapped]);
+    let odometry = of_two([&raw(ways[0]), &raw(ways[1])]);
+    let alone = mean_nearest(&[0, 1].map(half));
+    println!("nearest points: {merged:.3} m of two robots, {alone:.3} m of one, {odometry:.3} m by odometry");
+    assert!(merged < AGREE * alone && odometry > 2.0 * merged, "{merged} m, {alone} m alone, {odometry} m by odometry");
+}
+
+/// Of the second cloud's points to the nearest of the first; farther than [`SAME_M`] it is something else.
+fn mean_nearest([a, b]: &[Vec<[f64; 2]>; 2]) -> f64 {
+    let tree = ImmutableKdTree::<f64, 2>::new_from_slice(a).unwrap();
+    let distance = |p| tree.query(p).nearest_one::<SquaredEuclidean<f64>>().execute().distance.sqrt();
+    let near: Vec<f64> = b.iter().map(distance).filter(|distance| *distance < SAME_M).collect();
+    near.iter().sum::<f64>() / near.len() as f64
 }
 
 #[test]
@@ -104,9 +176,14 @@ fn robots_merge(robots: usize) {
         let known = submap.t_own_anchor.as_ref().and_then(relation);
         known.map(|t| anchors.entry(submap.robot.clone()).or_default().insert(submap.index, t.pose));
     }
-    let robot = |r: &Recording| r.manifest().robot.as_str().to_owned();
-    let ways: Vec<Way> =
-        recordings.iter().map(|r| Way::of(r, anchors.get(&robot(r)).unwrap_or(&BTreeMap::new()))).collect();
+    let own: Vec<Snapshot> = wires.agents.iter().map(|agent| agent.snapshot(wires.now)).collect();
+    let ways: Vec<Way> = recordings.iter().zip(&own).map(|(r, own)| Way::of(r, &own.path, &map)).collect();
+    for ((recording, way), own) in recordings.iter().zip(&ways).zip(&own) {
+        let anchors = anchors.get(recording.manifest().robot.as_str()).unwrap();
+        passes_through(way, &own.path, anchors);
+        is_tied(way, own);
+    }
+    clouds_agree([&recordings[0], &recordings[1]], [&ways[0], &ways[1]]);
 
     let at = |name: &str| -> Option<Se3> {
         let (frame, index) = name.rsplit_once('#')?;

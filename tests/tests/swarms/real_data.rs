@@ -24,8 +24,8 @@ fn merge(data: &Path, seed: u64) -> Evaluation {
     let wires = play(&recordings, seed).unwrap();
     let tracks: Vec<Track> = recordings.iter().map(Track::of).collect();
     let views = |agent: &Agent| {
-        let Snapshot { status, frames, map, graph, stats, .. } = agent.snapshot(wires.now);
-        Views { status, frames, map, graph, stats }
+        let Snapshot { status, frames, map, path, graph, stats, .. } = agent.snapshot(wires.now);
+        Views { status, frames, map, path, graph, stats }
     };
     let views: Vec<Views> = wires.agents.iter().map(views).collect();
     evaluate(&tracks, &views, if seed == DEMO_SEED { &GOAL } else { &BOUNDS })

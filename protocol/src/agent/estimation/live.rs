@@ -13,7 +13,7 @@ use crate::agent::replication::Body;
 use crate::agent::replication::beacons::Beacons;
 use crate::agent::replication::knowledge::Gaps;
 use crate::estimate::MapProblem;
-use crate::geometry::{PoseWithCovariance, Relative};
+use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::{RobotId, SubmapId};
 use crate::snapshot::{RelationView, RobotPairView, RobotView};
 use crate::time::Instant;
@@ -69,8 +69,13 @@ pub(super) fn live_pairs(me: RobotId, live: &[Live], problem: &MapProblem, gaps:
     pairs_among(&live.iter().map(anchors_of).collect::<Vec<_>>(), is_ours_first)
 }
 
-/// Live pose = estimate ∘ beacon.
-pub(in crate::agent) fn robot_view(context: &Context, estimation: &Estimation, live: &Live) -> RobotView {
+/// Live pose = estimate ∘ beacon. `t_odom_body` is of this robot alone: where its SLAM has it.
+pub(in crate::agent) fn robot_view(
+    context: &Context,
+    estimation: &Estimation,
+    live: &Live,
+    t_odom_body: Option<Se3>,
+) -> RobotView {
     let t_own_body = estimation.t_own_body(context.frame(), live.anchor, &live.t_anchor_body);
     RobotView {
         robot: context.robot_name(live.robot),
@@ -78,6 +83,7 @@ pub(in crate::agent) fn robot_view(context: &Context, estimation: &Estimation, l
         stamp_secs: live.stamp_secs,
         anchor: context.submap_name(live.anchor),
         t_own_body: t_own_body.as_ref().map(RelationView::from),
+        t_map_odom: t_own_body.zip(t_odom_body).map(|(body, odom)| RelationView::from(&body.onto(&odom.inverse()))),
     }
 }
 

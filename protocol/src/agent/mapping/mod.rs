@@ -1,8 +1,10 @@
 //! The robot's own side: keyframes in, submaps cut and described one at a time, so that they are stated in order; and
 //! what its sensors tell of other robots. It has no timers: all that it does is called for by an input.
 
+mod path;
 mod sighting;
 
+pub use path::PATH_KEYFRAMES_MAX;
 pub use sighting::{SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
 
 use super::context::Context;
@@ -13,6 +15,7 @@ use super::replication::knowledge::Knowledge;
 use crate::config::SubmapConfig;
 use crate::geometry::{PoseWithCovariance, Se3};
 use crate::ids::{Hash, SubmapId};
+use crate::snapshot::PathView;
 use crate::submap::continuity::FrameSign;
 use crate::submap::runs::Runs;
 use crate::submap::{Described, Keyframe, KeyframeError, Submap, SubmapBuilder};
@@ -20,6 +23,7 @@ use crate::time::{Instant, Stamp};
 use crate::wire::fact::{Fact, SubmapFact};
 use core::num::NonZero;
 use core::time::Duration;
+use path::Path;
 use sighting::Positions;
 use std::collections::VecDeque;
 
@@ -40,6 +44,7 @@ pub(super) struct Mapping {
     queue: VecDeque<(SubmapId, Submap)>,
     describing: Option<(JobId, SubmapId)>,
     keyframes: u64,
+    path: Path,
     positions: Positions,
 }
 
@@ -72,6 +77,7 @@ impl Mapping {
             queue: VecDeque::new(),
             describing: None,
             keyframes: 0,
+            path: Path::default(),
             positions: Positions::default(),
         }
     }
@@ -81,9 +87,11 @@ impl Mapping {
         self.builder = self.builder.begun_anew(session_is_over);
         self.behind = None;
         (self.last, self.twist) = (None, None);
+        self.path = Path::default();
     }
 
     fn taken(&mut self, pose: &Se3, stamp: Stamp) {
+        self.path.take(stamp, *pose);
         let last = self.last.replace((*pose, stamp));
         self.twist = last.and_then(|(last, at)| Twist::between(&last, pose, stamp.secs_since(at)));
     }
@@ -111,6 +119,16 @@ impl Mapping {
     /// The last finished submap and the body's pose in its anchor.
     pub(super) fn body(&self) -> Option<(u32, PoseWithCovariance, Stamp)> {
         self.builder.body_since_anchor()
+    }
+
+    /// `t_odom_body` of the last keyframe of this frame, as the SLAM sent it.
+    pub(super) fn t_odom_body(&self) -> Option<Se3> {
+        self.last.map(|(t_odom_body, _)| t_odom_body)
+    }
+
+    /// The keyframes of the present frame.
+    pub(super) fn path_view(&self, frame: String) -> PathView {
+        PathView { frame, keyframes: self.path.keyframes(), forgotten: self.path.forgotten() }
     }
 
     /// Whether there is room for a keyframe; if not, it is refused.
@@ -174,6 +192,7 @@ impl Mapping {
             context.event(Event::ViewsDisagree { frame: context.frame(), misfit_voxels });
         }
         if let Some(submap) = closed {
+            self.path.close(&submap);
             let id = SubmapId { frame: context.frame(), index: submap.index };
             self.queue.push_back((id, submap));
         }
