@@ -273,6 +273,9 @@ pub struct EdgeView {
     pub weight: f64,
     /// Why it is not used, or counts less than it claims; empty where it counts in full.
     pub reason: String,
+    /// It is not used because the rest of what is known speaks against it.
+    #[serde(default)]
+    pub contradicts: bool,
 }
 
 /// `view/stats`: counters since start.

@@ -3,11 +3,12 @@
 //! local perturbation, MATH §1), which is χ²₆ if the covariance is honest; χ²₇ where a robot's unit is unknown, and the
 //! error has a scale. All functions here are pure.
 
+use super::certainty::Certainty;
 use super::track::Track;
 use super::trajectory::{self, Corrected, TrajectoryError};
 use super::views::{Views, relative};
 use merganser_protocol::geometry::{Relative, Sim3, chi2};
-use merganser_protocol::snapshot::PairStatus;
+use merganser_protocol::snapshot::{PairStatus, PairView};
 use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::SVector;
 
@@ -26,27 +27,14 @@ const SAME_UNIT: f64 = 1e-9;
 /// Estimates of different robots may differ by this, m (or units), rad and log-scale.
 const SAME: f64 = 1e-6;
 
-/// How large the error of a frame alignment may be.
+/// How large the error of a frame alignment may be: a goal for data that are known. Of others only what the robots claim
+/// can be judged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounds {
     /// Translation, m.
     pub translation_m: f64,
     /// Rotation, degrees.
     pub rotation_deg: f64,
-}
-
-/// Twice what a good odometry drifts, share of the way and degrees per metre. A frame lies where its robot set out;
-/// seen from where two robots met, it is as far off as the odometry from there to there.
-const DRIFT: (f64, f64) = (0.01, 0.004);
-
-impl Bounds {
-    /// These bounds, but no less than odometry drifts on drives of so many metres.
-    pub fn for_drives_of(self, metres: f64) -> Self {
-        Self {
-            translation_m: self.translation_m.max(DRIFT.0 * metres),
-            rotation_deg: self.rotation_deg.max(DRIFT.1 * metres),
-        }
-    }
 }
 
 /// An estimate's error.
@@ -106,12 +94,18 @@ impl PoseError {
         format!(", scale {:+.2} %", 100.0 * (self.scale - 1.0))
     }
 
-    /// Whether it is within the bounds, scale included, and inside the claimed 99.9 % ellipsoid.
-    fn is_within(&self, bounds: &Bounds) -> bool {
-        self.translation_m <= bounds.translation_m
-            && self.rotation_deg <= bounds.rotation_deg
-            && (self.scale - 1.0).abs() <= SCALE_OFF_MAX
-            && self.nees <= if self.degrees_of_freedom == 7 { CHI2_7_999 } else { CHI2_6_999 }
+    /// Whether it is within the bounds, scale included, if there are any.
+    fn is_within(&self, bounds: Option<&Bounds>) -> bool {
+        bounds.is_none_or(|bounds| {
+            self.translation_m <= bounds.translation_m
+                && self.rotation_deg <= bounds.rotation_deg
+                && (self.scale - 1.0).abs() <= SCALE_OFF_MAX
+        })
+    }
+
+    /// Whether the truth lies inside the claimed 99.9 % ellipsoid.
+    fn inside_999(&self) -> bool {
+        self.nees <= if self.degrees_of_freedom == 7 { CHI2_7_999 } else { CHI2_6_999 }
     }
 }
 
@@ -132,6 +126,11 @@ pub struct Pair {
     pub truth: Option<Sim3>,
     /// Their difference.
     pub error: Option<PoseError>,
+    /// That of the two anchors in the middle of what both saw: what a merge is worth shows there. The frames' origins may
+    /// be far away.
+    pub middle: Option<PoseError>,
+    /// What the map itself says for and against it.
+    pub certainty: Certainty,
 }
 
 /// Errors of the single alignments between submaps that the joint estimate uses: whether their covariances are honest
@@ -220,7 +219,7 @@ fn others<'a>(tracks: &'a [Track], name: &'a str) -> impl Iterator<Item = &'a st
 }
 
 /// Judges the views of all robots (in the order of `tracks`) against the truth.
-pub fn evaluate(tracks: &[Track], views: &[Views], bounds: &Bounds) -> Evaluation {
+pub fn evaluate(tracks: &[Track], views: &[Views], bounds: Option<&Bounds>) -> Evaluation {
     let pairs = pairs(tracks, views);
     let corrected: Vec<Option<Corrected>> = match views.first() {
         Some(reference) => {
@@ -250,19 +249,32 @@ fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {
             t_a_b,
             truth,
             error: t_a_b.zip(truth).zip(a.unit_m).map(|((t, truth), unit_m)| PoseError::of(&t, &truth, unit_m)),
+            middle: view.and_then(|view| middle(tracks, views, view)),
+            certainty: Certainty::of(&views[0], &[&views[i], &views[j]].map(|views| views.frames.own.as_str())),
         });
     }
     pairs
 }
 
+/// True `t_world_anchor` of a submap, `name/epoch#index`, of any of the robots.
+fn true_anchor(tracks: &[Track], views: &[Views], submap: &str) -> Option<Sim3> {
+    let (frame, _) = submap.rsplit_once('#')?;
+    let robot = views.iter().position(|views| views.frames.own == frame)?;
+    trajectory::true_anchor(tracks.get(robot)?, &views[robot], submap)
+}
+
+/// How far off a pair is where both robots were.
+fn middle(tracks: &[Track], views: &[Views], pair: &PairView) -> Option<PoseError> {
+    let middle = pair.middle.as_ref()?;
+    let [i, j] = [&middle.i, &middle.j].map(|submap| true_anchor(tracks, views, submap));
+    let (i, j) = (i?, j?);
+    Some(PoseError::of(&relative(&middle.t_i_j)?, &(i.inverse() * j), i.scale))
+}
+
 /// Compares the alignments that the first robot uses with the truth.
 fn singles(tracks: &[Track], views: &[Views]) -> Singles {
     let Some(reference) = views.first() else { return Singles::default() };
-    let t_world_anchor = |submap: &str| {
-        let (frame, _) = submap.rsplit_once('#')?;
-        let robot = views.iter().position(|views| views.frames.own == frame)?;
-        trajectory::true_anchor(tracks.get(robot)?, &views[robot], submap)
-    };
+    let t_world_anchor = |submap: &str| true_anchor(tracks, views, submap);
     let used = reference.graph.edges.iter().filter(|edge| edge.kind == "alignment" && edge.weight > 0.0);
     let mut singles = Singles::default();
     for edge in used {
@@ -289,7 +301,7 @@ fn indices(n: usize) -> impl Iterator<Item = (usize, usize)> {
     (0..n).flat_map(move |i| (i + 1..n).map(move |j| (i, j)))
 }
 
-fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: &Bounds) -> Vec<Check> {
+fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: Option<&Bounds>) -> Vec<Check> {
     let check = |what: &str, held, found: String| Check { what: what.into(), held, found };
     let statuses: Vec<_> = views.iter().map(|views| Some(&views.status)).collect();
     let missing = missing(tracks, &statuses);
@@ -299,37 +311,60 @@ fn checks(tracks: &[Track], views: &[Views], pairs: &[Pair], bounds: &Bounds) ->
     let found = difference.map_or("an estimate is absent".into(), |d| format!("{d:.1e} apart"));
     checks.push(check("all robots hold the same estimate", difference.is_some_and(|d| d <= SAME), found));
     let truths = pairs.iter().any(|pair| pair.truth.is_some());
+    let against = contradictions(views, pairs);
+    checks.push(check("the map does not contradict itself", against.is_empty(), against.join("; ")));
     let of_pair = |((i, j), pair)| pair_check([&tracks[i], &tracks[j]], pair, truths, bounds);
     checks.extend(indices(tracks.len()).zip(pairs).filter_map(of_pair));
     checks
 }
 
+/// What the map says against itself, a line each.
+fn contradictions(views: &[Views], pairs: &[Pair]) -> Vec<String> {
+    let of_pair = |pair: &Pair| {
+        let [a, b] = &pair.robots;
+        let Certainty { hold, contradict, .. } = pair.certainty;
+        match pair.status {
+            Some(PairStatus::Inconsistent) => Some(format!("{a}–{b} is inconsistent")),
+            Some(PairStatus::Merged) if contradict >= hold.max(1) => {
+                Some(format!("{a}–{b}: {hold} alignments hold, {contradict} contradict them"))
+            }
+            _ => None,
+        }
+    };
+    let failed = views.iter().flat_map(|views| {
+        let of = views.status.robot.as_str();
+        views.graph.failed.iter().map(move |failed| format!("{of} could not solve it: {}", failed.reason))
+    });
+    pairs.iter().filter_map(of_pair).chain(failed).collect()
+}
+
 /// How two frames are related. Where one's unit is unknown that must be a similarity, whatever the units happen to be,
 /// and nobody can say how far off it is unless the recordings state the units.
-fn pair_check(tracks: [&Track; 2], pair: &Pair, truths: bool, bounds: &Bounds) -> Option<Check> {
+fn pair_check(tracks: [&Track; 2], pair: &Pair, truths: bool, bounds: Option<&Bounds>) -> Option<Check> {
     let scaled = tracks.iter().any(|track| track.scale == ScaleKind::Unknown);
     let judged = truths && tracks.iter().all(|track| track.unit_m.is_some());
     let [a, b] = &pair.robots;
-    let Bounds { translation_m, rotation_deg } = bounds;
+    let kind = if scaled { "a similarity" } else { "a rigid motion" };
+    let bound = bounds.map_or(String::new(), |Bounds { translation_m, rotation_deg }| {
+        let scale = if scaled { format!(" and {:.0} % of scale", 100.0 * SCALE_OFF_MAX) } else { String::new() };
+        format!(", error at most {translation_m:.2} m, {rotation_deg:.1}°{scale}")
+    });
     let what = match (scaled, judged) {
         (false, false) => return None,
-        (false, true) => format!(
-            "{a}–{b}: error at most {translation_m:.2} m and {rotation_deg:.1}°, and inside the 99.9 % ellipsoid"
-        ),
-        (true, true) => format!(
-            "{a}–{b}: a similarity, error at most {translation_m:.2} m, {rotation_deg:.1}° and {:.0} % of scale, and \
-             inside the 99.9 % ellipsoid",
-            100.0 * SCALE_OFF_MAX
-        ),
+        (_, true) => format!("{a}–{b}: {kind}{bound}, and inside the claimed 99.9 % ellipsoid"),
         (true, false) => format!("{a}–{b}: a similarity; how far off is unknown without unit_m and truth"),
     };
     let fits = !scaled || matches!(pair.t_a_b, Some(Relative::Similarity(_)));
     let kind = if fits { "" } else { "a rigid motion, " };
+    let error = |e: &PoseError| {
+        format!("{:.3} m, {:.2}°{}, NEES {:.1}", e.translation_m, e.rotation_deg, e.scale_off(), e.nees)
+    };
+    let middle = pair.middle.as_ref().map_or(String::new(), |middle| format!("; where both were {}", error(middle)));
     let (held, found) = match (&pair.t_a_b, &pair.error) {
-        (_, Some(e)) => (
-            fits && e.is_within(bounds),
-            format!("{kind}{:.3} m, {:.2}°{}, NEES {:.1}", e.translation_m, e.rotation_deg, e.scale_off(), e.nees),
-        ),
+        (_, Some(e)) => {
+            let claimed = [Some(e), pair.middle.as_ref()].into_iter().flatten().all(PoseError::inside_999);
+            (fits && claimed && e.is_within(bounds), format!("{kind}{}{middle}", error(e)))
+        }
         (Some(_), None) if !judged => (fits, kind.trim_end_matches(", ").into()),
         _ => (false, "no alignment of the frames, or no truth".into()),
     };

@@ -1,5 +1,6 @@
 //! What the demonstration prints.
 
+use super::certainty::Certainty;
 use super::evaluate::{CHI2_6_95, CHI2_7_95, Check, Evaluation, Pair, Singles};
 use super::track::Track;
 use super::trajectory::TrajectoryError;
@@ -105,6 +106,7 @@ fn alignment(text: &mut String, pair: &Pair) {
     if let Some(log_sigma) = s.get(6) {
         let _ = writeln!(text, "    scale       {:>8.4}   σ {:.2} %", sim.scale, 100.0 * log_sigma);
     }
+    certainty(text, &pair.certainty);
     let Some(e) = &pair.error else { return };
     let verdict = if e.inside_95() { style("inside").green() } else { style("outside").red() };
     let _ = writeln!(
@@ -115,6 +117,18 @@ fn alignment(text: &mut String, pair: &Pair) {
         e.scale_off(),
         e.nees
     );
+}
+
+/// What the map says for and against itself, and how well it knows how the two lie where both were.
+fn certainty(text: &mut String, certainty: &Certainty) {
+    let Certainty { hold, contradict, middle } = certainty;
+    let _ = write!(text, "    by itself    {hold} alignments hold, {contradict} contradict");
+    if let Some(([i, j], s)) = middle {
+        let way = s[..3].iter().fold(0.0_f64, |a, b| a.max(*b));
+        let turn = s[3..6].iter().fold(0.0_f64, |a, b| a.max(*b)).to_degrees();
+        let _ = write!(text, "; {j} in {i} known to {way:.3}, {turn:.2}° (largest σ)");
+    }
+    text.push('\n');
 }
 
 fn trajectory(text: &mut String, errors: &TrajectoryError, tracks: &[Track]) {

@@ -22,14 +22,14 @@ const NAMES: [&str; 3] = ["alpha", "beta", "gamma"];
 pub(super) const BOUNDS: Bounds = Bounds { translation_m: 0.15, rotation_deg: 1.5 };
 /// Keyframes of a robot and of a submap.
 const KEYFRAMES: usize = 12;
-const PER_SUBMAP: usize = 4;
+pub(super) const PER_SUBMAP: usize = 4;
 
 fn pose(rho: [f64; 3], phi: [f64; 3]) -> Se3 {
     Se3::exp(&Vector6::new(rho[0], rho[1], rho[2], phi[0], phi[1], phi[2]))
 }
 
 /// A covariance with unequal axes and correlations.
-fn covariance() -> Covariance<6> {
+pub(super) fn covariance() -> Covariance<6> {
     let a = Matrix6::from_fn(|r, c| if r == c { 0.02 * (r + 1) as f64 } else { 0.003 * ((r * 2 + c) % 3) as f64 });
     Covariance::new(a * a.transpose()).unwrap()
 }
@@ -53,11 +53,11 @@ pub(super) fn tracks() -> Vec<Track> {
     NAMES.iter().enumerate().map(track).collect()
 }
 
-fn relation(pose: Se3) -> RelationView {
+pub(super) fn relation(pose: Se3) -> RelationView {
     RelationView::from(&Relative::Metric(PoseWithCovariance { pose, covariance: covariance() }))
 }
 
-fn frame(robot: usize) -> String {
+pub(super) fn frame(robot: usize) -> String {
     format!("{}/7", NAMES[robot])
 }
 
@@ -138,6 +138,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
                 agreed: true,
                 weight: 1.0,
                 reason: String::new(),
+                contradicts: false,
             }],
             ..GraphView::default()
         },
@@ -146,7 +147,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
 }
 
 /// What a robot shows of its keyframes if its scans put them there.
-fn path(tracks: &[Track], own: usize, t_frame_body: impl Fn(usize) -> Se3) -> PathView {
+pub(super) fn path(tracks: &[Track], own: usize, t_frame_body: impl Fn(usize) -> Se3) -> PathView {
     let track = &tracks[own];
     let keyframe = |k: usize| KeyframeView {
         stamp_secs: track.stamps_secs[k],
@@ -205,10 +206,10 @@ fn an_honest_estimate_has_nees_of_six_and_lies_inside_in_95_percent() {
 #[test]
 fn a_true_map_passes_every_check() {
     let tracks = tracks();
-    let evaluation = evaluate(&tracks, &all_views(&tracks, &Vector6::zeros()), &BOUNDS);
+    let evaluation = evaluate(&tracks, &all_views(&tracks, &Vector6::zeros()), Some(&BOUNDS));
     assert!(evaluation.held(), "{:?}", evaluation.checks);
     assert_eq!(evaluation.pairs.len(), 3);
-    assert_eq!(evaluation.checks.len(), 5);
+    assert_eq!(evaluation.checks.len(), 6);
     let errors = evaluation.trajectory.unwrap();
     assert!(errors.alone_m.1 > errors.merged_m.1, "{errors:?}");
     // The anchors are true: only the drift inside each submap is left, and none at an anchor.
@@ -221,50 +222,12 @@ fn a_true_map_passes_every_check() {
     assert_eq!(corrected.anchors.len(), 3);
 }
 
-/// Scans correct the odometry, so that anchors lie on another way than the poses that the SLAM sent: hung from anchors,
-/// those would be off by all that was corrected.
-#[test]
-fn paths_are_those_that_anchors_lie_on() {
-    let tracks = tracks();
-    let mut views = all_views(&tracks, &Vector6::zeros());
-    let t_world = |robot: usize| tracks[robot].t_world_frame().unwrap().to_se3();
-    for (own, track) in tracks.iter().enumerate() {
-        let right = |k: usize| t_world(own).inverse() * track.truth.as_ref().unwrap()[k];
-        views[own].path = path(&tracks, own, right);
-        for submap in views.iter_mut().flat_map(|views| &mut views.map.submaps) {
-            if submap.frame == frame(own) {
-                submap.t_frame_anchor = PoseView::from(&right(submap.index as usize * PER_SUBMAP));
-            }
-        }
-    }
-    // A keyframe that was refused goes on by odometry.
-    let lost = views[1].path.keyframes.remove(PER_SUBMAP + 2);
-    let evaluation = evaluate(&tracks, &views, &BOUNDS);
-    let t_ref_world = t_world(0).inverse();
-    for (robot, track) in tracks.iter().enumerate() {
-        let corrected = evaluation.corrected[robot].as_ref().unwrap();
-        for (k, body) in corrected.poses.iter().enumerate() {
-            let truth = t_ref_world * track.truth.as_ref().unwrap()[k];
-            let off = truth.local(&body.to_se3()).norm();
-            if track.stamps_secs[k] != lost.stamp_secs || robot != 1 {
-                assert!(off < 1e-9, "{robot} {k}: {off}");
-            } else {
-                let before = track.truth.as_ref().unwrap()[k - 1];
-                let step = track.odometry[k - 1].inverse() * track.odometry[k];
-                assert!((t_ref_world * before * step).local(&body.to_se3()).norm() < 1e-9 && off > 1e-3, "{off}");
-            }
-        }
-    }
-    // The alignment is judged by where its anchors truly are, too.
-    assert!(evaluation.singles.count == 1 && evaluation.singles.nees_mean < 1e-9, "{:?}", evaluation.singles);
-}
-
 #[test]
 fn single_alignments_are_compared_with_the_anchors_truth() {
     let tracks = tracks();
     let singles = |x: f64| {
         let error = Vector6::new(x, 0.0, 0.0, 0.0, 0.0, 0.0);
-        evaluate(&tracks, &all_views(&tracks, &error), &BOUNDS).singles
+        evaluate(&tracks, &all_views(&tracks, &error), Some(&BOUNDS)).singles
     };
     let per_square = covariance().mahalanobis_squared(&Vector6::x());
     for (x, inside_95) in [(0.0, 1), (0.01, 1), (0.2, 0)] {
@@ -287,7 +250,7 @@ fn a_pair_stated_the_other_way_round_is_the_same() {
         pair.t_a_b = Some(RelationView::from(&Relative::Metric(t)));
         std::mem::swap(&mut pair.a, &mut pair.b);
     }
-    let (a, b) = (evaluate(&tracks, &straight, &BOUNDS), evaluate(&tracks, &turned, &BOUNDS));
+    let (a, b) = (evaluate(&tracks, &straight, Some(&BOUNDS)), evaluate(&tracks, &turned, Some(&BOUNDS)));
     assert!(a.held() && b.held());
     for (a, b) in a.pairs.iter().zip(&b.pairs) {
         assert_eq!(a.robots, b.robots);
@@ -296,11 +259,11 @@ fn a_pair_stated_the_other_way_round_is_the_same() {
 }
 
 /// The checks that do not hold after `spoil`.
-fn broken(error: &Vector6<f64>, spoil: impl FnOnce(&mut Vec<Views>)) -> Vec<String> {
+pub(super) fn broken(error: &Vector6<f64>, spoil: impl FnOnce(&mut Vec<Views>)) -> Vec<String> {
     let tracks = tracks();
     let mut views = all_views(&tracks, error);
     spoil(&mut views);
-    let checks = evaluate(&tracks, &views, &BOUNDS).checks;
+    let checks = evaluate(&tracks, &views, Some(&BOUNDS)).checks;
     checks.into_iter().filter(|check| !check.held).map(|check| format!("{}: {}", check.what, check.found)).collect()
 }
 
@@ -310,7 +273,7 @@ fn each_check_bites() {
     assert!(broken(&none, |_| ()).is_empty());
     // The bound: one side of it, and the other.
     let shift = |x: f64| Vector6::new(x, 0.0, 0.0, 0.0, 0.0, 0.0);
-    let wide = |views: &mut Vec<Views>| {
+    let wide: fn(&mut Vec<Views>) = |views| {
         for pair in views.iter_mut().flat_map(|v| &mut v.frames.pairs) {
             pair.t_a_b.as_mut().unwrap().covariance.iter_mut().for_each(|c| *c *= 100.0);
         }
@@ -320,10 +283,14 @@ fn each_check_bites() {
     let turn = |deg: f64| Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, deg.to_radians());
     assert!(broken(&turn(1.49), wide).is_empty());
     assert_eq!(broken(&turn(1.51), wide).len(), 3);
-    // A frame that a long drive set out from may be off by what the odometry drifts, and no more.
-    assert_eq!(BOUNDS.for_drives_of(15.0), BOUNDS);
-    let long = BOUNDS.for_drives_of(1000.0);
-    assert!((long.translation_m - 10.0).abs() < 1e-12 && (long.rotation_deg - 4.0).abs() < 1e-12);
+    // Where no bound is known, an honest claim is enough.
+    let unknown = |views: &[Views]| evaluate(&tracks(), views, None).held();
+    let off = |x: f64, spoil: fn(&mut Vec<Views>)| {
+        let mut views = all_views(&tracks(), &shift(x));
+        spoil(&mut views);
+        views
+    };
+    assert!(unknown(&off(0.151, wide)) && !unknown(&off(0.5, |_| ())));
     // Small, but claimed to be much smaller.
     let narrow = |views: &mut Vec<Views>| {
         for pair in views.iter_mut().flat_map(|v| &mut v.frames.pairs) {
@@ -384,6 +351,7 @@ fn views_are_read_from_json_and_bad_ones_are_not() {
         ("status".to_owned(), serde_json::to_vec(&views.status).unwrap()),
         ("frames".to_owned(), serde_json::to_vec(&views.frames).unwrap()),
         ("map".to_owned(), serde_json::to_vec(&views.map).unwrap()),
+        ("path".to_owned(), serde_json::to_vec(&views.path).unwrap()),
         ("graph".to_owned(), serde_json::to_vec(&views.graph).unwrap()),
         ("stats".to_owned(), serde_json::to_vec(&stats).unwrap()),
     ]);
@@ -462,7 +430,7 @@ fn all_outputs_are_written() {
         after: Duration::from_secs(3),
         views: all_views(&tracks, &Vector6::new(0.01, 0.0, 0.0, 0.0, 0.0, 0.0)),
     };
-    let evaluation = evaluate(&tracks, &seen.views, &BOUNDS);
+    let evaluation = evaluate(&tracks, &seen.views, Some(&BOUNDS));
     let out = dir.path().join("out");
     fs::create_dir(&out).unwrap();
     let files = write(&recordings, &tracks, &seen, &evaluation, &out).unwrap();

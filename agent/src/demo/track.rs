@@ -56,8 +56,3 @@ impl Track {
         Some(t_world_body * unit * Sim3::from_se3(&self.odometry.first()?.inverse()))
     }
 }
-
-/// The longest way by odometry, m. A drive of so many units that nobody knows is no length, and excuses no error.
-pub fn longest_m(tracks: &[Track]) -> f64 {
-    tracks.iter().filter(|track| track.unit_m.is_some()).map(Track::driven_m).fold(0.0, f64::max)
-}

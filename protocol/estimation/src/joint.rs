@@ -143,6 +143,13 @@ pub enum Unused {
     Failed(ComponentError<Node>),
 }
 
+impl Unused {
+    /// It is fit to count, and the rest of what is known speaks against it.
+    pub fn contradicts(&self) -> bool {
+        matches!(self, Self::Outvoted | Self::Odometry(_) | Self::OtherLoops | Self::FrameLoop | Self::Contradicts(_))
+    }
+}
+
 /// A measurement and what became of it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EdgeEstimate {

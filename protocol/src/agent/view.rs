@@ -198,6 +198,7 @@ impl Agent {
                 agreed: true,
                 weight: edge.weight,
                 reason: edge.reason(),
+                contradicts: edge.unused.is_some_and(|unused| unused.contradicts()),
             });
         }
         edges.extend(self.unused_edges(&listed));
@@ -246,6 +247,7 @@ impl Agent {
                     agreed: agreement == Agreement::Agreed,
                     weight: 0.0,
                     reason: self.reason_outside(id, fact, agreement),
+                    contradicts: false,
                 }
             })
             .collect()

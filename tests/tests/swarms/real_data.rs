@@ -28,7 +28,7 @@ fn merge(data: &Path, seed: u64) -> Evaluation {
         Views { status, frames, map, path, graph, stats }
     };
     let views: Vec<Views> = wires.agents.iter().map(views).collect();
-    evaluate(&tracks, &views, if seed == DEMO_SEED { &GOAL } else { &BOUNDS })
+    evaluate(&tracks, &views, Some(if seed == DEMO_SEED { &GOAL } else { &BOUNDS }))
 }
 
 #[test]
