@@ -46,7 +46,8 @@ pub struct Stated {
 pub struct Reference {
     /// The wheels' pose of every scan.
     pub odometry: BTreeMap<Stamp, Se3>,
-    /// True poses at some of the stamps.
+    /// True poses of some of the scans, by the scan's own stamp: logs that were written in bursts have several within a
+    /// millisecond, each turned on by a tenth of a radian.
     poses: BTreeMap<Stamp, Se3>,
     /// Relations that were published.
     pub relations: Vec<Stated>,
@@ -70,9 +71,13 @@ impl Reference {
         let rows = rows(path)?;
         let all = rows.len();
         let reference = if is_tum {
-            let poses: BTreeMap<Stamp, Se3> = rows.iter().map(tum).collect();
-            let known = poses.keys().filter(|stamp| nearest(&odometry, **stamp).is_some()).count();
-            let remarks = unknown(path, all - known, all);
+            let of_scan = |row| {
+                let (stamp, pose) = tum(row);
+                Some((nearest(&odometry, stamp)?.0, pose))
+            };
+            let known: Vec<(Stamp, Se3)> = rows.iter().filter_map(of_scan).collect();
+            let remarks = unknown(path, all - known.len(), all);
+            let poses = known.into_iter().collect();
             Self { odometry, poses, relations: Vec::new(), remarks }
         } else {
             let relations = relations(&rows, &odometry);
@@ -87,20 +92,23 @@ impl Reference {
     }
 
     /// `t_world_body` at a scan's stamp: the true poses before and after it, and between them what the wheels say, mended
-    /// so that it leads from one to the other; and how far the nearer of the two is by the wheels, m and rad together.
-    /// `None` before the first, after the last, and where they are far apart.
+    /// so that it leads from one to the other; and how doubtful that is, m and rad together: what wheels err by from the
+    /// nearer of the two, or how far off the body would be had it moved evenly, whichever is more. Logs repeat a pose of
+    /// wheels for a scan of a body that has turned on meanwhile. `None` before the first, after the last, and where they
+    /// are far apart.
     pub fn at(&self, stamp: Stamp) -> Option<(Se3, f64)> {
-        let slack = Stamp(stamp.0.saturating_add(SAME_NANOS));
-        let before = self.poses.range(..=slack).next_back()?;
-        if (before.0.0 - stamp.0).abs() <= SAME_NANOS {
+        let (stamp, here) = nearest(&self.odometry, stamp)?;
+        let before = self.poses.range(..=stamp).next_back()?;
+        if *before.0 == stamp {
             return Some((*before.1, 0.0));
         }
         let after = self.poses.range(stamp..).next()?;
-        let raw = |stamp: Stamp| nearest(&self.odometry, stamp).map(|(_, pose)| pose);
-        let [from, here, to] = [*before.0, stamp, *after.0].map(raw);
-        let (from, here, to) = (from?, here?, to?);
+        let (from, to) = (*self.odometry.get(before.0)?, *self.odometry.get(after.0)?);
         let near = moved(&from, &here).min(moved(&here, &to));
-        (moved(&from, &to) <= APART_MAX).then(|| (mended([&from, &to], &here, [before.1, after.1]), near))
+        let mended = mended([&from, &to], &here, [before.1, after.1]);
+        let share = stamp.secs_since(*before.0) / after.0.secs_since(*before.0);
+        let evenly = moved(&mended, &before.1.interpolate(after.1, share));
+        (moved(&from, &to) <= APART_MAX).then_some((mended, evenly.max(WHEELS[0] * near)))
     }
 }
 
@@ -262,6 +270,44 @@ mod tests {
         // 0 is the first stamp of this log, so 3 is none of its.
         assert_eq!(named(&[row(0.0, 3.0)], 0.0), []);
         assert!(way(&log(0.0), &[]).unwrap_err().to_string().contains("no line names two scans"));
+    }
+
+    /// A scan is itself, and not another one half a millisecond away.
+    #[test]
+    fn scans_of_a_burst_are_told_apart() {
+        let at = |k: i64| Stamp(k * 500_000);
+        let pose = |k: i64| planar(0.0, 0.0, 0.1 * k as f64);
+        let odometry: BTreeMap<Stamp, Se3> = (0..5).map(|k| (at(k), pose(k))).collect();
+        let poses = [1, 3].map(|k| (at(k), pose(k))).into();
+        let reference = Reference { odometry, poses, relations: Vec::new(), remarks: Vec::new() };
+        for k in 1..4 {
+            let (here, doubt) = reference.at(at(k)).unwrap();
+            assert!(here.local(&pose(k)).norm() < 1e-9, "scan {k} is at {here:?}");
+            assert!((doubt - if k == 2 { WHEELS[0] * 0.1 } else { 0.0 }).abs() < 1e-9, "scan {k}: {doubt}");
+        }
+        // A stamp that was rounded otherwise is that of the nearest scan.
+        assert!(reference.at(Stamp(at(3).0 + 200_000)).unwrap().0.local(&pose(3)).norm() < 1e-9);
+        assert!(reference.at(at(0)).is_none() && reference.at(at(4)).is_none());
+    }
+
+    /// A robot turns by 0.4 rad in two seconds, and the wheels repeat their pose for the scan in between: it may be as
+    /// wrong as half of that. Where the wheels turn with it, they err by their share of the way.
+    #[test]
+    fn a_scan_with_a_stale_pose_of_wheels_is_doubtful() {
+        let truth: BTreeMap<Stamp, Se3> = [0.0, 2.0].map(|s| (stamp(s), planar(0.0, 0.0, 0.2 * s))).into();
+        let doubt = |between: f64| {
+            let turns = [(0.0, 0.0), (1.0, between), (2.0, 0.4)];
+            let odometry = turns.map(|(s, turn)| (stamp(s), planar(0.0, 0.0, turn))).into();
+            let reference = Reference { odometry, poses: truth.clone(), relations: Vec::new(), remarks: Vec::new() };
+            reference.at(stamp(1.0)).unwrap().1
+        };
+        assert!(
+            (doubt(0.0) - 0.2).abs() < 1e-9 && (doubt(0.2) - WHEELS[0] * 0.2).abs() < 1e-9,
+            "{} {}",
+            doubt(0.0),
+            doubt(0.2)
+        );
+        assert!((doubt(0.1) - 0.1).abs() < 1e-9, "{}", doubt(0.1));
     }
 
     /// Wheels that turn too much by a tenth on a square are mended by what was checked by hand.

@@ -13,6 +13,9 @@ use std::collections::BTreeMap;
 /// What a submap says of its own keyframes is so much better than what wheels say of as long a way.
 const SUBMAP_SHARE: f64 = 0.05;
 
+/// Where an anchor is more doubtful than this, m and rad together, it is not judged.
+const DOUBT_MAX: f64 = 0.05;
+
 /// One robot.
 #[derive(Debug)]
 pub struct Track {
@@ -86,7 +89,7 @@ impl Track {
         self.within.extend(submap.keyframes.iter().map(|t_anchor_body| (submap.index, *t_anchor_body)));
         // Of a keyframe between two true poses the wheels tell, badly; where the anchor is from it, the scans, well.
         let price = |k: &usize| vague[*k] + SUBMAP_SHARE * self.within[*k].1.translation.norm();
-        let known = (first..self.within.len()).filter(|k| self.truth[*k].is_some());
+        let known = (first..self.within.len()).filter(|k| self.truth[*k].is_some() && price(k) <= DOUBT_MAX);
         let best = known.min_by(|a, b| price(a).total_cmp(&price(b)));
         let anchor = best.and_then(|k| Some(self.truth[k]? * self.within[k].1.inverse()));
         if let Some(anchor) = anchor.or_else(|| placed(submap, survey)) {
