@@ -51,6 +51,9 @@ pub struct Reference {
     poses: BTreeMap<Stamp, Se3>,
     /// Relations that were published.
     pub relations: Vec<Stated>,
+    /// They name scans by their place in the log, which were found again by the odometry: it may be that of the scan
+    /// before or after, and the body turn meanwhile.
+    by_place: bool,
     /// What was amiss with the truth, a sentence each.
     pub remarks: Vec<String>,
 }
@@ -78,12 +81,12 @@ impl Reference {
             let known: Vec<(Stamp, Se3)> = rows.iter().filter_map(of_scan).collect();
             let remarks = unknown(path, all - known.len(), all);
             let poses = known.into_iter().collect();
-            Self { odometry, poses, relations: Vec::new(), remarks }
+            Self { odometry, poses, relations: Vec::new(), by_place: false, remarks }
         } else {
-            let relations = relations(&rows, &odometry);
+            let (relations, by_place) = relations(&rows, &odometry);
             let poses = way(&odometry, &relations).with_context(|| path.display().to_string())?;
             let remarks = unknown(path, all - relations.len(), all);
-            Self { odometry, poses, relations, remarks }
+            Self { odometry, poses, relations, by_place, remarks }
         };
         if reference.poses.is_empty() {
             return Err(anyhow!("{}: no line is of a stamp of {}", path.display(), set.path.display()));
@@ -100,15 +103,25 @@ impl Reference {
         let (stamp, here) = nearest(&self.odometry, stamp)?;
         let before = self.poses.range(..=stamp).next_back()?;
         if *before.0 == stamp {
-            return Some((*before.1, 0.0));
+            return Some((*before.1, self.doubt(stamp)));
         }
         let after = self.poses.range(stamp..).next()?;
         let (from, to) = (*self.odometry.get(before.0)?, *self.odometry.get(after.0)?);
         let near = moved(&from, &here).min(moved(&here, &to));
         let mended = mended([&from, &to], &here, [before.1, after.1]);
         let share = stamp.secs_since(*before.0) / after.0.secs_since(*before.0);
+        let doubt = self.doubt(*before.0).max(self.doubt(*after.0));
         let evenly = moved(&mended, &before.1.interpolate(after.1, share));
-        (moved(&from, &to) <= APART_MAX).then_some((mended, evenly.max(WHEELS[0] * near)))
+        (moved(&from, &to) <= APART_MAX).then_some((mended, doubt.max(evenly).max(WHEELS[0] * near)))
+    }
+
+    /// How doubtful a true pose itself is, m and rad together: half of what the body moves from the scan before to the one
+    /// after, if the pose may be of either.
+    fn doubt(&self, stamp: Stamp) -> f64 {
+        let before = self.odometry.range(..stamp).next_back();
+        let after = self.odometry.range(stamp..).find(|(s, _)| **s > stamp);
+        let moves = before.zip(after).map_or(0.0, |((_, from), (_, to))| moved(from, to));
+        if self.by_place { 0.5 * moves } else { 0.0 }
     }
 }
 
@@ -183,9 +196,9 @@ fn tum(row: &[f64; 8]) -> (Stamp, Se3) {
     (stamp(seconds), planar(x, y, 2.0 * libm::atan2(qz, qw)))
 }
 
-/// The relations of scans of the log. A log that lost its stamps has relations that name scans by their place in it,
+/// The relations of scans of the log, and whether they name them by their place in it. A log that lost its stamps has relations that name scans by their place in it,
 /// counted from 0: that is so where all that they name are whole numbers, none of which is a stamp.
-fn relations(rows: &[[f64; 8]], odometry: &BTreeMap<Stamp, Se3>) -> Vec<Stated> {
+fn relations(rows: &[[f64; 8]], odometry: &BTreeMap<Stamp, Se3>) -> (Vec<Stated>, bool) {
     let stamps: Vec<Stamp> = odometry.keys().copied().collect();
     let stamped = |seconds: f64| nearest(odometry, stamp(seconds)).map(|(stamp, _)| stamp);
     let counted = |place: f64| stamps.get(place as usize).copied();
@@ -196,7 +209,7 @@ fn relations(rows: &[[f64; 8]], odometry: &BTreeMap<Stamp, Se3>) -> Vec<Stated> 
         let [from, to] = [from, to].map(|name| if by_place { counted(name) } else { stamped(name) });
         Some(Stated { from: from?, to: to?, t_from_to: planar(x, y, yaw) })
     };
-    rows.iter().filter_map(relation).collect()
+    (rows.iter().filter_map(relation).collect(), by_place)
 }
 
 /// The scan of a stamp, which may be rounded differently.
@@ -261,7 +274,7 @@ mod tests {
         };
         let row = |from: f64, to: f64| [from, to, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
         let named = |rows: &[[f64; 8]], begins: f64| -> Vec<(Stamp, Stamp)> {
-            relations(rows, &log(begins)).iter().map(|r| (r.from, r.to)).collect()
+            relations(rows, &log(begins)).0.iter().map(|r| (r.from, r.to)).collect()
         };
         let second_and_fifth = (stamp(1000.44), stamp(1001.76));
         assert_eq!(named(&[row(1.0, 4.0), row(1.0, 90.0)], 1000.0), [second_and_fifth], "90 is beyond the log");
@@ -279,12 +292,16 @@ mod tests {
         let pose = |k: i64| planar(0.0, 0.0, 0.1 * k as f64);
         let odometry: BTreeMap<Stamp, Se3> = (0..5).map(|k| (at(k), pose(k))).collect();
         let poses = [1, 3].map(|k| (at(k), pose(k))).into();
-        let reference = Reference { odometry, poses, relations: Vec::new(), remarks: Vec::new() };
+        let reference = Reference { odometry, poses, relations: Vec::new(), by_place: false, remarks: Vec::new() };
         for k in 1..4 {
             let (here, doubt) = reference.at(at(k)).unwrap();
             assert!(here.local(&pose(k)).norm() < 1e-9, "scan {k} is at {here:?}");
             assert!((doubt - if k == 2 { WHEELS[0] * 0.1 } else { 0.0 }).abs() < 1e-9, "scan {k}: {doubt}");
         }
+        // Where scans were found again by the odometry, a pose may be of the scan before or after.
+        let by_place = Reference { by_place: true, ..reference };
+        assert!((by_place.at(at(1)).unwrap().1 - 0.1).abs() < 1e-9);
+        let reference = Reference { by_place: false, ..by_place };
         // A stamp that was rounded otherwise is that of the nearest scan.
         assert!(reference.at(Stamp(at(3).0 + 200_000)).unwrap().0.local(&pose(3)).norm() < 1e-9);
         assert!(reference.at(at(0)).is_none() && reference.at(at(4)).is_none());
@@ -298,7 +315,13 @@ mod tests {
         let doubt = |between: f64| {
             let turns = [(0.0, 0.0), (1.0, between), (2.0, 0.4)];
             let odometry = turns.map(|(s, turn)| (stamp(s), planar(0.0, 0.0, turn))).into();
-            let reference = Reference { odometry, poses: truth.clone(), relations: Vec::new(), remarks: Vec::new() };
+            let reference = Reference {
+                odometry,
+                poses: truth.clone(),
+                relations: Vec::new(),
+                by_place: false,
+                remarks: Vec::new(),
+            };
             reference.at(stamp(1.0)).unwrap().1
         };
         assert!(
