@@ -115,13 +115,13 @@ impl Reference {
         (moved(&from, &to) <= APART_MAX).then_some((mended, doubt.max(evenly).max(WHEELS[0] * near)))
     }
 
-    /// How doubtful a true pose itself is, m and rad together: half of what the body moves from the scan before to the one
-    /// after, if the pose may be of either.
+    /// How doubtful a true pose itself is, rad: half of what the body turns from the scan before to the one after, if the
+    /// pose may be of either. On a straight way all poses are then early or late alike, which relations do not show.
     fn doubt(&self, stamp: Stamp) -> f64 {
         let before = self.odometry.range(..stamp).next_back();
         let after = self.odometry.range(stamp..).find(|(s, _)| **s > stamp);
-        let moves = before.zip(after).map_or(0.0, |((_, from), (_, to))| moved(from, to));
-        if self.by_place { 0.5 * moves } else { 0.0 }
+        let turns = before.zip(after).map_or(0.0, |((_, from), (_, to))| (from.inverse() * *to).rotation.angle());
+        if self.by_place { 0.5 * turns } else { 0.0 }
     }
 }
 
@@ -196,8 +196,8 @@ fn tum(row: &[f64; 8]) -> (Stamp, Se3) {
     (stamp(seconds), planar(x, y, 2.0 * libm::atan2(qz, qw)))
 }
 
-/// The relations of scans of the log, and whether they name them by their place in it. A log that lost its stamps has relations that name scans by their place in it,
-/// counted from 0: that is so where all that they name are whole numbers, none of which is a stamp.
+/// The relations of scans of the log, and whether they name them by their place in it. A log that lost its stamps has
+/// relations that do, counted from 0: that is so where all that they name are whole numbers, none of which is a stamp.
 fn relations(rows: &[[f64; 8]], odometry: &BTreeMap<Stamp, Se3>) -> (Vec<Stated>, bool) {
     let stamps: Vec<Stamp> = odometry.keys().copied().collect();
     let stamped = |seconds: f64| nearest(odometry, stamp(seconds)).map(|(stamp, _)| stamp);
