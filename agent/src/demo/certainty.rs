@@ -4,10 +4,10 @@
 use super::views::{Views, relative};
 use merganser_protocol::geometry::Relative;
 
-/// Of two robots.
+/// Of two robots, or of the loops of one.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Certainty {
-    /// Agreed alignments of the two that count in the map.
+    /// Agreed alignments that count in the map.
     pub hold: usize,
     /// Such that do not, because the rest of what is known contradicts them.
     pub contradict: usize,
@@ -17,7 +17,7 @@ pub struct Certainty {
 }
 
 impl Certainty {
-    /// What `views` know of two frames.
+    /// What `views` know of two frames, or, if they are one, of its loops.
     pub fn of(views: &Views, frames: &[&str; 2]) -> Self {
         let frame = |submap: &str| submap.rsplit_once('#').map_or(String::new(), |(frame, _)| frame.to_owned());
         let ties = |i: &str, j: &str| {

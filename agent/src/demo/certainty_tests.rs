@@ -72,6 +72,28 @@ fn a_map_that_contradicts_itself_is_told() {
     assert!(told.len() == 1 && told[0].contains("gamma could not solve it: it did not converge"), "{told:?}");
 }
 
+/// Loops of one robot are counted apart from alignments of two.
+#[test]
+fn loops_that_contradict_are_told() {
+    let tracks = tracks();
+    let mut views = all_views(&tracks, &Vector6::zeros());
+    let one = views[0].graph.edges[0].clone();
+    let own = |contradicts| EdgeView {
+        j: "alpha/7#2".into(),
+        weight: if contradicts { 0.0 } else { 1.0 },
+        contradicts,
+        ..one.clone()
+    };
+    views[0].graph.edges.extend([own(false), own(true), own(true)]);
+    let evaluation = evaluate(&tracks, &views, None);
+    let told: Vec<_> = evaluation.loops.iter().map(|c| (c.hold, c.contradict)).collect();
+    assert_eq!(told, [(1, 2), (0, 0), (0, 0)]);
+    assert_eq!((evaluation.pairs[0].certainty.hold, evaluation.pairs[0].certainty.contradict), (1, 0));
+    let printed = super::report::evaluation(&evaluation, &tracks);
+    assert!(printed.contains("Loops of alpha: 1 alignments hold, 2 contradict"), "{printed}");
+    assert!(!printed.contains("Loops of beta"), "{printed}");
+}
+
 /// What a merge is worth shows where both were: a frame may lie well there, and its origin be far off, or the reverse.
 #[test]
 fn a_pair_is_judged_where_both_were() {

@@ -167,6 +167,8 @@ pub struct Evaluation {
     pub pairs: Vec<Pair>,
     /// Every robot's path in the frame of the first robot, where merged.
     pub corrected: Vec<Option<Corrected>>,
+    /// What the map says for and against the loops of each robot, in the order of the tracks.
+    pub loops: Vec<Certainty>,
     /// The single alignments.
     pub singles: Singles,
     /// The paths' errors, if all merged and all truths are known.
@@ -230,7 +232,9 @@ pub fn evaluate(tracks: &[Track], views: &[Views], bounds: Option<&Bounds>) -> E
     let trajectory = trajectory::errors(tracks, &corrected);
     let singles = singles(tracks, views);
     let checks = checks(tracks, views, &pairs, bounds);
-    Evaluation { pairs, corrected, singles, trajectory, checks }
+    let own = |robot: &Views| Certainty::of(&views[0], &[robot.frames.own.as_str(); 2]);
+    let loops = views.iter().map(own).collect();
+    Evaluation { pairs, corrected, loops, singles, trajectory, checks }
 }
 
 fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {

@@ -44,6 +44,11 @@ pub(super) fn evaluation(evaluation: &Evaluation, tracks: &[Track]) -> String {
         let bound = bounds_95(evaluation);
         let _ = writeln!(text, "  {inside} of {all} errors lie inside their claimed 95 % ellipsoid (NEES ≤ {bound})");
     }
+    for (track, Certainty { hold, contradict, .. }) in tracks.iter().zip(&evaluation.loops) {
+        if hold + contradict > 0 {
+            let _ = writeln!(text, "  Loops of {}: {hold} alignments hold, {contradict} contradict", track.name);
+        }
+    }
     let Singles { count, nees_mean, inside_95, translation_rms_m, rotation_rms_deg } = evaluation.singles;
     if count > 0 {
         let _ = writeln!(

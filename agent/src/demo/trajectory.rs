@@ -47,8 +47,8 @@ pub fn true_anchor(track: &Track, own: &Views, submap: &str) -> Option<Sim3> {
     let t_anchor_frame = pose(&view.t_frame_anchor)?.inverse();
     let keyframes = own.path.keyframes.iter().filter(|keyframe| own.path.frame == frame && keyframe.submap == index);
     let within = keyframes.filter_map(|keyframe| {
-        let near = |k: &usize| (track.stamps_secs[*k] - keyframe.stamp_secs).abs() <= STAMP_SLACK_SECS;
-        let k = (0..track.stamps_secs.len()).find(near)?;
+        let k = track.stamps_secs.partition_point(|stamp| *stamp < keyframe.stamp_secs - STAMP_SLACK_SECS);
+        track.stamps_secs.get(k).filter(|stamp| **stamp <= keyframe.stamp_secs + STAMP_SLACK_SECS)?;
         Some((k, t_anchor_frame * pose(&keyframe.t_frame_body)?))
     });
     let (k, t_anchor_body) = within.min_by(|(_, a), (_, b)| a.log().norm().total_cmp(&b.log().norm()))?;

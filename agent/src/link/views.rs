@@ -30,8 +30,9 @@ const REPEAT: Duration = Duration::from_secs(5);
 /// The views of one moment, by name.
 pub type Views = BTreeMap<&'static str, Vec<u8>>;
 
-/// Views of a snapshot as JSON, a document for each. `shell` are the agent's own counters, shown in `stats`.
-pub fn render(snapshot: &Snapshot, large: bool, shell: &BTreeMap<String, u64>) -> serde_json::Result<Views> {
+/// Views of a snapshot as JSON, a document for each, the large ones only if they are wanted. `shell` are the agent's own
+/// counters, shown in `stats`.
+pub fn render(snapshot: &Snapshot, wanted: &[&str], shell: &BTreeMap<String, u64>) -> serde_json::Result<Views> {
     let mut stats = serde_json::to_value(&snapshot.stats)?;
     stats["shell"] = serde_json::to_value(shell)?;
     let mut views = BTreeMap::from([
@@ -41,8 +42,10 @@ pub fn render(snapshot: &Snapshot, large: bool, shell: &BTreeMap<String, u64>) -
         ("graph", serde_json::to_vec(&snapshot.graph)?),
         ("stats", serde_json::to_vec(&stats)?),
     ]);
-    if large {
+    if wanted.contains(&"map") {
         views.insert("map", serde_json::to_vec(&snapshot.map)?);
+    }
+    if wanted.contains(&"path") {
         views.insert("path", serde_json::to_vec(&snapshot.path)?);
     }
     Ok(views)
@@ -120,7 +123,7 @@ impl Server {
             zenoh::key_expr::KeyExpr::new(key.as_str()).is_ok_and(|key| question.key_expr().intersects(&key))
         };
         let wanted: Vec<&str> = keys::VIEWS.into_iter().filter(asked).collect();
-        let views = self.views(wanted.iter().any(|view| LARGE.contains(view))).await?;
+        let views = self.views(&wanted).await?;
         for view in wanted {
             let (key, json) = (self.shared.own(&format!("view/{view}")), views[view].clone());
             self.shared.reply(question.clone(), key, json, keys::view_encoding(view));
@@ -139,7 +142,7 @@ impl Server {
         if wanted.is_empty() {
             return Some(());
         }
-        let views = self.views(wanted.iter().any(|view| LARGE.contains(view))).await?;
+        let views = self.views(&wanted).await?;
         for view in wanted {
             self.publish_one(view, &views[view]).await;
         }
@@ -164,16 +167,17 @@ impl Server {
         self.published.insert(view, (now, json.to_vec()));
     }
 
-    /// The views of a moment that has just been, with the large ones if they are wanted.
-    async fn views(&mut self, large: bool) -> Option<Arc<Views>> {
+    /// The views of a moment that has just been, with those of the large ones that are wanted.
+    async fn views(&mut self, wanted: &[&str]) -> Option<Arc<Views>> {
         let serves = |(when, views): &&(Instant, Arc<Views>)| {
-            when.elapsed() < FRESH && (!large || LARGE.iter().all(|view| views.contains_key(view)))
+            when.elapsed() < FRESH && wanted.iter().all(|view| views.contains_key(view))
         };
         if let Some((_, views)) = self.last.as_ref().filter(serves) {
             return Some(views.clone());
         }
+        let large = wanted.iter().any(|view| LARGE.contains(view));
         let snapshot = if large { self.snapshots.take().await? } else { self.snapshots.overview().await? };
-        let rendered = render(&snapshot, large, &self.shared.drops().counts());
+        let rendered = render(&snapshot, wanted, &self.shared.drops().counts());
         let views = Arc::new(rendered.unwrap_or_else(|reason| {
             tracing::error!(%reason, "a view cannot be written as JSON; this is a bug");
             keys::VIEWS.iter().map(|view| (*view, b"null".to_vec())).collect()
