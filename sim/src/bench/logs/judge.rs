@@ -55,7 +55,9 @@ pub struct Judged {
     pub alignments: [usize; 3],
     /// Of those agreed and those used, how many are false.
     pub falsely: [usize; 2],
-    /// Those in words.
+    /// Of those used, how many tie an anchor whose truth is not known.
+    pub used_unjudged: usize,
+    /// The false ones in words.
     pub false_ones: Vec<String>,
     /// Every two robots.
     pub pairs: BTreeMap<(usize, usize), PairFate>,
@@ -96,7 +98,7 @@ impl Judge<'_> {
         let mut judged = Judged { pairs: self.overlaps(), ..Judged::default() };
         self.statements(&wires.statements, wires.now, &mut judged);
         if let Some(view) = views.first() {
-            self.alignments(view, &mut judged);
+            self.alignments(&view.graph.edges, &mut judged);
             for pair in &view.frames.pairs {
                 let (Some(a), Some(b)) = (self.robot(&pair.a), self.robot(&pair.b)) else { continue };
                 judged.pairs.entry((a.min(b), a.max(b))).or_default().status = Some(pair.status);
@@ -200,18 +202,24 @@ impl Judge<'_> {
         }
     }
 
-    fn alignments(&self, view: &Snapshot, judged: &mut Judged) {
+    fn alignments(&self, edges: &[EdgeView], judged: &mut Judged) {
         let error = |edge: &EdgeView| {
             let ends = (self.anchor(&edge.i)?, self.anchor(&edge.j)?, pose(&edge.t_i_j.pose)?);
             let ((_, i), (_, j), t) = ends;
             Some(off(&t, &(i.inverse() * j)))
         };
-        for edge in view.graph.edges.iter().filter(|edge| edge.kind == "alignment") {
+        for edge in edges.iter().filter(|edge| edge.kind == "alignment") {
             let (agreed, used) = (usize::from(edge.agreed), usize::from(edge.weight > 0.0));
             judged.alignments[0] += 1;
             judged.alignments[1] += agreed;
             judged.alignments[2] += used;
-            let Some((metres, degrees)) = error(edge).filter(|e| e.0 > FALSE.0 || e.1 > FALSE.1) else { continue };
+            let Some((metres, degrees)) = error(edge) else {
+                judged.used_unjudged += used;
+                continue;
+            };
+            if metres <= FALSE.0 && degrees <= FALSE.1 {
+                continue;
+            }
             judged.falsely[0] += agreed;
             judged.falsely[1] += used;
             if edge.agreed {
@@ -368,5 +376,29 @@ mod tests {
         assert!(!fate(&[said(20, 0, Some(0.0))]).merged && !fate(&[said(20, 1, Some(0.0))]).merged);
         let fate = fate(&[said(20, 0, Some(0.0)), said(20, 1, Some(0.0)), said(50, 1, None)]);
         assert!(!fate.merged && fate.fell_apart == 1);
+    }
+
+    /// What ties an anchor without truth is neither right nor false.
+    #[test]
+    fn a_false_alignment_is_told_from_one_that_nobody_can_judge() {
+        let (tracks, mut judged) = (tracks(), Judged::default());
+        let edge = |j: &str, off: f64| {
+            let covariance = Covariance::from_sigmas([0.1; 6]).unwrap();
+            let t_i_j = Relative::Metric(PoseWithCovariance { pose: along(off - 10.0), covariance });
+            EdgeView {
+                kind: "alignment".into(),
+                i: "a/0#0".into(),
+                j: j.into(),
+                t_i_j: RelationView::from(&t_i_j),
+                agreed: true,
+                weight: 1.0,
+                reason: String::new(),
+                contradicts: false,
+            }
+        };
+        let judge = Judge { tracks: &tracks, planar: true, truth: TRUTH };
+        judge.alignments(&[edge("b/0#0", 0.0), edge("b/0#0", 1.1), edge("b/0#7", 9.0)], &mut judged);
+        assert_eq!((judged.alignments, judged.falsely, judged.used_unjudged), ([3, 3, 3], [1, 1], 1));
+        assert!(matches!(judged.false_ones.as_slice(), [one] if one.contains("1.10 m")), "{:?}", judged.false_ones);
     }
 }

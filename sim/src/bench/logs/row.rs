@@ -8,7 +8,7 @@ use super::{Played, Prepared};
 use std::io::Write;
 
 /// Names of the columns.
-pub const COLUMNS: [&str; 26] = [
+pub const COLUMNS: [&str; 27] = [
     "set",
     "wires",
     "robots",
@@ -32,6 +32,7 @@ pub const COLUMNS: [&str; 26] = [
     "between_deg",
     "nees_pairs",
     "nees_anchors",
+    "used_unjudged",
     "bytes",
     "cpu_s",
     "verdict",
@@ -128,14 +129,17 @@ impl Row {
             fields.extend([format!("{metres:.3}"), format!("{degrees:.2}")]);
         }
         fields.extend([nees_pairs, nees_anchors].map(|all| format!("{:.2}", mean(all))));
-        fields.extend([bytes.to_string(), format!("{:.1}", self.cpu_s), self.verdict().into()]);
+        fields.extend([self.judged.used_unjudged.to_string(), bytes.to_string()]);
+        fields.extend([format!("{:.1}", self.cpu_s), self.verdict().into()]);
         fields
     }
 
     /// In words.
     pub fn print(&self, out: &mut impl Write) -> std::io::Result<()> {
         let Self { set, wires, keyframes, cpu_s, judged, .. } = self;
-        let [[within_m, within_deg], [between_m, between_deg]] = [&judged.within, &judged.between].map(means);
+        let [[within_m, within_deg], [between_m, between_deg]] = [&judged.within, &judged.between]
+            .map(means)
+            .map(|[metres, degrees]| [number(metres, 3), number(degrees, 2)]);
         let [overlapping, merged] = self.overlapping();
         let ([stated, agreed, used], [false_agreed, false_used]) = (judged.alignments, judged.falsely);
         writeln!(out, "{set} ({wires}): {}", self.verdict())?;
@@ -147,12 +151,14 @@ impl Row {
         )?;
         writeln!(
             out,
-            "  alignments: {stated} stated, {agreed} agreed ({false_agreed} false), {used} used ({false_used} false)"
+            "  alignments: {stated} stated, {agreed} agreed ({false_agreed} false), {used} used ({false_used} false, {} not \
+             judged)",
+            judged.used_unjudged
         )?;
         writeln!(
             out,
-            "  pairs that overlap: {overlapping}, merged {merged}, {:.0} s later (median); fell apart {} times",
-            self.wait(),
+            "  pairs that overlap: {overlapping}, merged {merged}, {} s later (median); fell apart {} times",
+            number(self.wait(), 0),
             self.fell_apart()
         )?;
         writeln!(
@@ -165,18 +171,18 @@ impl Row {
         )?;
         writeln!(
             out,
-            "  relations: within one robot {within_m:.3} m {within_deg:.2} deg of {}, between robots {between_m:.3} m \
-             {between_deg:.2} deg of {}",
+            "  relations: within one robot {within_m} m {within_deg} deg of {}, between robots {between_m} m \
+             {between_deg} deg of {}",
             judged.within.len(),
             judged.between.len()
         )?;
         let [pairs, anchors] = [&judged.nees_pairs, &judged.nees_anchors];
         writeln!(
             out,
-            "  NEES per degree of freedom: pairs {:.2} of {}, anchors {:.2} of {}",
-            mean(pairs),
+            "  NEES per degree of freedom: pairs {} of {}, anchors {} of {}",
+            number(mean(pairs), 2),
             pairs.len(),
-            mean(anchors),
+            number(mean(anchors), 2),
             anchors.len()
         )?;
         judged.pairs.iter().try_for_each(|((a, b), pair)| self.print_pair(out, [*a, *b], pair))?;
@@ -204,6 +210,11 @@ impl Row {
     }
 }
 
+/// A figure, or that there is none.
+fn number(value: f64, digits: usize) -> String {
+    if value.is_finite() { format!("{value:.digits$}") } else { "–".into() }
+}
+
 fn mean(all: &[f64]) -> f64 {
     all.iter().sum::<f64>() / all.len() as f64
 }
@@ -222,6 +233,15 @@ mod tests {
         let judged = Judged { pairs: BTreeMap::from([((0, 1), pair)]), falsely, ..Judged::default() };
         let robots = vec!["a".into(), "b".into()];
         Row { set: "log".into(), wires: "perfect".into(), robots, keyframes: 7, judged, cpu_s: 1.0 }
+    }
+
+    #[test]
+    fn what_was_not_found_is_no_number() {
+        assert_eq!((number(0.126, 2), number(f64::NAN, 2)), ("0.13".into(), "–".into()));
+        let mut printed = Vec::new();
+        row(PairFate::default(), [0, 0]).print(&mut printed).unwrap();
+        let printed = String::from_utf8(printed).unwrap();
+        assert!(printed.contains("– m – deg of 0") && !printed.contains("NaN"), "{printed}");
     }
 
     #[test]
