@@ -36,7 +36,7 @@ impl<const N: usize, G: Scaled<N>> Measured<'_, N, G> {
         let candidates = self.candidates(&pairs);
         let explanation = Explanation::best(self, &pairs, &mut evidence, &candidates);
         let Some(explanation) = explanation else { return FrameOutcome::Inconsistent };
-        let Some(best) = Hypothesis::settle(self, &pairs, explanation.used(&mut evidence)) else {
+        let Some(best) = Hypothesis::settle(self, &pairs, explanation.used(&mut evidence, n)) else {
             return FrameOutcome::Inconsistent;
         };
         let (best, certain) = self.beyond_doubt(&pairs, &mut evidence, best);

@@ -47,13 +47,12 @@ impl<const N: usize> Doubt<N> {
     ) -> Self {
         let set = answer.set;
         let mut doubt = Self { certain: set, risk: 0.0, covariance: SMatrix::zeros() };
-        let (n, k) = (measured.alignments.len() as f64, f64::from(set.count_ones()));
-        if k <= 2.0 {
+        if set.count_ones() <= 2 {
             return doubt;
         }
         let mut doubts = 0.0;
         for l in clique::vertices(set) {
-            let odds = NEAR_MISSES * (n - k + 0.5) / k * exp(-evidence.of_member(set, l));
+            let odds = odds_of_false(measured.alignments.len(), set, evidence.of_member(set, l));
             let p = odds / (1.0 + odds);
             if odds > DOUBTFUL {
                 doubt.certain &= !bit(l);
@@ -74,6 +73,12 @@ impl<const N: usize> Doubt<N> {
         }
         doubt
     }
+}
+
+/// Odds that a member of `set` among `n` alignments is false, where it adds `gain` to the evidence of the set.
+pub(super) fn odds_of_false(n: usize, set: Set, gain: f64) -> f64 {
+    let (n, k) = (n as f64, f64::from(set.count_ones()));
+    NEAR_MISSES * (n - k + 0.5) / k * exp(-gain)
 }
 
 fn solve<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, pairs: &Pairs, set: Set) -> Option<Gls<N, G>> {

@@ -7,6 +7,7 @@
 //! where it is loose, a narrow one.
 
 use super::clique::{self, Set, bit};
+use super::doubt::odds_of_false;
 use super::evidence::Evidence;
 use super::gate;
 use super::measured::Measured;
@@ -15,8 +16,8 @@ use super::scaled::Scaled;
 
 /// What an alignment must add to a set's evidence to be one of it, as a logarithm: a hundredfold.
 const MEMBER_MIN: f64 = 4.6;
-/// What it must add to be used, more: near misses are more frequent than chance spread evenly.
-const USED_MIN: f64 = 6.5;
+/// Odds of being false from which a member is not used.
+const FALSE_MAX: f64 = 0.1;
 /// A member of one set that adds as much to the other, to a hundredth, may be either's.
 const CONTESTED: f64 = 4.6;
 /// An alignment is tried for a set if it agrees with a member at this many times the widest gate.
@@ -101,13 +102,15 @@ impl Explanation {
         self
     }
 
-    /// The first set without members that add too little to be used, the weakest first.
-    pub(super) fn used<const N: usize, G: Scaled<N>>(&self, evidence: &mut Evidence<'_, N, G>) -> Set {
+    /// The first set of `n` alignments without members that may well be false, the weakest first. What a member must add
+    /// depends on how many contradict: where all agree, alignments of a small room, each too vague to prove much, are
+    /// used together, while among as many others as members the same are not.
+    pub(super) fn used<const N: usize, G: Scaled<N>>(&self, evidence: &mut Evidence<'_, N, G>, n: usize) -> Set {
         let mut set = self.first;
         while set.count_ones() > 2 {
             let gains = clique::vertices(set).map(|l| (evidence.of_member(set, l), l));
             match gains.min_by(|a, b| a.0.total_cmp(&b.0)) {
-                Some((gain, l)) if gain < USED_MIN => set &= !bit(l),
+                Some((gain, l)) if odds_of_false(n, set, gain) > FALSE_MAX => set &= !bit(l),
                 _ => break,
             }
         }
