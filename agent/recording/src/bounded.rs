@@ -2,9 +2,18 @@
 
 use super::error::{Problem, RecordingError, on};
 use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX};
+use super::remark::Remark;
 use std::fs::File;
-use std::io::Read;
+use std::io::Read as _;
 use std::path::Path;
+
+/// What a cloud holds, as exactly as it says.
+pub(super) struct Read {
+    /// x, y, z of each point.
+    pub points: Vec<[f64; 3]>,
+    /// What was odd.
+    pub remarks: Vec<Remark>,
+}
 
 /// A problem in a cloud, with the line where its format has lines.
 pub(super) struct Fault {

@@ -166,6 +166,46 @@ pub enum Problem {
         /// Bytes due.
         expected: usize,
     },
+    /// A `.bin` that does not divide into points of four floats.
+    #[error(
+        "{found} bytes are no whole number of points of four 32-bit floats, x y z reflectance{}; write those, or state \
+         clouds = \"xyz-bin\" for points of x y z alone",
+        if *fives { format!(" (though {} points of five)", found / 20) } else { ", or the file was cut off".into() }
+    )]
+    BinLength {
+        /// Bytes of the file.
+        found: usize,
+        /// Whether they are points of five floats.
+        fives: bool,
+    },
+    /// The fourth number of a point of a `.bin` is no reflectance.
+    #[error(
+        "the fourth number of point {index} (counted from 0) is {value}, which is no reflectance (0 to 65535): these \
+         are not points of four 32-bit floats, x y z reflectance; write those, or state clouds = \"xyz-bin\" for \
+         points of x y z alone"
+    )]
+    Reflectance {
+        /// The point.
+        index: usize,
+        /// Its fourth number.
+        value: f32,
+    },
+    /// Points lie so far from the body that single precision loses them.
+    #[error(
+        "point {index} (counted from 0) is {far:.0} m from the body in a cloud {across:.0} m across, where numbers of \
+         32 bits are {step} m apart; points are wanted in the body frame: undo the pose, and subtract the offset of \
+         map coordinates (UTM) from poses and points alike"
+    )]
+    Offset {
+        /// The point.
+        index: usize,
+        /// Its largest coordinate, m.
+        far: f64,
+        /// Largest extent of the cloud, m.
+        across: f64,
+        /// The grid on which single precision would put it, m.
+        step: f64,
+    },
     /// A cloud has too many points.
     #[error("the cloud has {0} points; at most {POINTS_MAX} (POINTS_MAX) are read: thin it")]
     CloudPoints(u64),

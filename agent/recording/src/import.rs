@@ -94,7 +94,7 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Prepared, Recording
             out
         }
         Kind::Lidar => {
-            import_lidar::import(data, out, seed)?;
+            remarks = import_lidar::import(data, out, seed)?;
             out
         }
         Kind::Carmen => {

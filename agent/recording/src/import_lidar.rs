@@ -2,18 +2,19 @@
 //! `NNNNNN/points.bin` of f32 x, y, z) and KITTI sequences (`NNNNNN.bin` of f32 x, y, z, intensity, and `poses.txt` in
 //! the LiDAR's frame: twelve numbers a line, the line being the scan's number, or `index x y z qx qy qz qw`).
 
-use super::Drift;
 use super::bounded::read_text;
 use super::cloud;
 use super::cut::{Cut, Scan};
 use super::error::{Problem, RecordingError, on};
 use super::import_rgbd::rigid;
 use super::table::{number, pose_of};
+use super::{Drift, Remarks};
 use crate::manifest::CloudFormat;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::geometry::Se3;
 use merganser_protocol::time::Stamp;
 use nalgebra::Matrix4;
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -34,8 +35,8 @@ const SCANS_PER_ROBOT_MIN: usize = 4;
 /// Submaps a robot should have at least, so that three alignments can be found.
 const SUBMAPS_PER_ROBOT: usize = 4;
 
-/// Writes two or three recordings into `out`.
-pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), RecordingError> {
+/// Writes two or three recordings into `out`; says what was odd.
+pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<Vec<String>, RecordingError> {
     let graph = data.join(GRAPH);
     let (poses, format, source): (_, _, fn(&Path, u32) -> PathBuf) = if graph.is_file() {
         let source = |data: &Path, index| data.join(format!("{index:06}")).join("points.bin");
@@ -74,7 +75,13 @@ pub(super) fn import(data: &Path, out: &Path, seed: u64) -> Result<(), Recording
     config.submap.keyframes_max = (scans.len() / (robots * SUBMAPS_PER_ROBOT)).clamp(1, 10) as u32;
     let origin = format!("{} LiDAR scans ({stated} poses) cut into {robots} robots by time", scans.len());
     let cut = Cut { robots, sensor: "lidar3d", origin, drift: DRIFT, seed, config };
-    cut.write(&scans, out, |scan| cloud::read(&scan.source, format))
+    let remarks = RefCell::new(Remarks::default());
+    cut.write(&scans, out, |scan| {
+        let (points, odd) = cloud::read_remarked(&scan.source, format)?;
+        remarks.borrow_mut().note(&scan.source, odd);
+        Ok(points)
+    })?;
+    Ok(remarks.into_inner().told())
 }
 
 /// When a LiDAR made the scan of this number.

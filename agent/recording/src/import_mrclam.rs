@@ -143,7 +143,6 @@ fn unpacked(path: &PathBuf) -> Result<Vec<u8>, RecordingError> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Recording;
     use super::super::import::{Kind, detect, prepare};
     use super::*;
     use std::fmt::Write as _;
@@ -175,7 +174,7 @@ mod tests {
         assert_eq!(detect(data.path()).unwrap(), Kind::Mrclam);
         let recordings = prepare(data.path(), out.path(), 1).unwrap().recordings;
         assert_eq!(recordings.iter().map(|r| r.manifest().robot.as_str()).collect::<Vec<_>>(), ["robot1", "robot2"]);
-        recordings.iter().try_for_each(Recording::check_clouds).unwrap();
+        recordings.iter().try_for_each(|recording| recording.check_clouds().map(drop)).unwrap();
         let keyframe = recordings[0].keyframe(5).unwrap();
         assert!(!keyframe.marks.is_empty() && keyframe.marks.len() == keyframe.points.len());
         assert!(keyframe.marks.iter().all(|mark| matches!(mark.label, Some(72 | 27))), "landmarks only, no robots");

@@ -20,7 +20,7 @@ fn imported(write: fn(&Path), spoil: impl FnOnce(&Path)) -> Result<(Kind, Vec<Re
     write(data.path());
     spoil(data.path());
     let recordings = prepare(data.path(), out.path(), 1)?.recordings;
-    recordings.iter().try_for_each(Recording::check_clouds)?;
+    recordings.iter().try_for_each(|recording| recording.check_clouds().map(drop))?;
     Ok((detect(data.path())?, recordings, out))
 }
 

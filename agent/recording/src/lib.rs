@@ -4,6 +4,8 @@
 //! [`Recording::open`] reads the manifest and both tables and looks for every cloud; the clouds themselves are read one
 //! by one, by [`Recording::keyframe`]. A bad recording is refused with one error that names file and line.
 
+mod axes;
+mod bin;
 mod bounded;
 pub mod carmen;
 pub mod cloud;
@@ -19,17 +21,22 @@ mod import_rgbd;
 mod landmarks;
 mod limits;
 mod line_error;
+mod lzf;
 pub mod manifest;
 pub mod mrclam;
 pub mod observation;
 mod pcd;
 mod places;
 pub mod ply;
+mod remark;
+mod scalar;
 mod table;
+mod text;
 mod write;
 
 pub use drift::Drift;
 pub use error::{Problem, RecordingError};
+pub use remark::{Remark, Remarks};
 pub use table::{KeyframeLine, TruthLine};
 pub use write::Writer;
 
@@ -106,12 +113,17 @@ impl Recording {
         Ok(Self { folder: folder.into(), manifest, keyframes, truth, positions, ups })
     }
 
-    /// Reads every cloud once, to find a bad one before any use.
+    /// Reads every cloud once, to find a bad one before any use; says what was odd in them.
     ///
     /// # Errors
     /// [`RecordingError`] for the first.
-    pub fn check_clouds(&self) -> Result<(), RecordingError> {
-        (0..self.len()).try_for_each(|index| self.keyframe(index).map(drop))
+    pub fn check_clouds(&self) -> Result<Remarks, RecordingError> {
+        let mut remarks = Remarks::default();
+        for (index, line) in self.keyframes.iter().enumerate() {
+            let (_, odd) = self.remarked(index)?;
+            remarks.note(&self.folder.join(&line.cloud), odd);
+        }
+        Ok(remarks)
     }
 
     /// Where it lies.
@@ -169,8 +181,7 @@ impl Recording {
     /// # Errors
     /// [`RecordingError`] if the cloud cannot be used, or there is no such keyframe.
     pub fn points(&self, index: usize) -> Result<Vec<[f32; 3]>, RecordingError> {
-        let line = self.line(index)?;
-        cloud::read(&self.folder.join(&line.cloud), self.manifest.clouds)
+        cloud::read(&self.folder.join(&self.line(index)?.cloud), self.manifest.clouds)
     }
 
     /// Keyframe `index` with its points.
@@ -178,8 +189,16 @@ impl Recording {
     /// # Errors
     /// As [`Recording::points`].
     pub fn keyframe(&self, index: usize) -> Result<Keyframe, RecordingError> {
-        let points = self.points(index)?;
+        self.remarked(index).map(|(keyframe, _)| keyframe)
+    }
+
+    /// The same, with what is odd in its cloud.
+    ///
+    /// # Errors
+    /// As [`Recording::points`].
+    pub fn remarked(&self, index: usize) -> Result<(Keyframe, Vec<Remark>), RecordingError> {
         let line = self.line(index)?;
+        let (points, odd) = cloud::read_remarked(&self.folder.join(&line.cloud), self.manifest.clouds)?;
         let covariance_of = self.manifest.covariance_of;
         let marks = if self.manifest.config.submap.sensor.sees_landmarks() {
             landmarks::read(&self.folder.join(&line.cloud), self.manifest.clouds)?
@@ -191,7 +210,9 @@ impl Recording {
             None => None,
         };
         let up = self.ups.get(index).copied().flatten();
-        Ok(Keyframe { stamp: line.stamp, session: None, pose: line.pose, covariance_of, points, marks, place, up })
+        let keyframe =
+            Keyframe { stamp: line.stamp, session: None, pose: line.pose, covariance_of, points, marks, place, up };
+        Ok((keyframe, odd))
     }
 
     fn line(&self, index: usize) -> Result<&KeyframeLine, RecordingError> {

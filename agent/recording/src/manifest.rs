@@ -96,11 +96,12 @@ pub struct PlaceFormat {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CloudFormat {
-    /// PLY, ASCII or binary little-endian, vertex properties x, y, z (float or double; others are skipped).
+    /// PLY, ASCII or binary, vertex properties x, y, z of any type; others, and other elements, are passed over.
     Ply,
-    /// PCD with fields x, y, z.
+    /// PCD with fields x, y, z of any type. `VIEWPOINT` is not applied.
     Pcd,
-    /// KITTI velodyne: little-endian f32 x, y, z, intensity.
+    /// KITTI velodyne: little-endian f32 x, y, z, reflectance; or nuScenes' x, y, z, intensity, ring, if all rings are
+    /// such.
     KittiBin,
     /// Little-endian f32 x, y, z.
     XyzBin,

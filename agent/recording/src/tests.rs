@@ -254,6 +254,25 @@ fn bad_clouds_are_told_when_they_are_read() {
 }
 
 #[test]
+fn what_is_odd_in_clouds_is_told_once_a_kind() {
+    let dir = good();
+    assert!(Recording::open(dir.path()).unwrap().check_clouds().unwrap().told().is_empty());
+    let manifest = dir.path().join(MANIFEST);
+    let text = fs::read_to_string(&manifest).unwrap();
+    fs::write(&manifest, text.replace("\"xyz-bin\"", "\"kitti-bin\"")).unwrap();
+    for k in 0..4 {
+        let five = |p: i32| [p as f32, -1.0, 2.0, 30.0, p as f32].map(f32::to_le_bytes).concat();
+        let fives: Vec<u8> = (0..8).flat_map(five).collect();
+        fs::write(dir.path().join(format!("clouds/{k:06}.bin")), fives).unwrap();
+    }
+    let recording = Recording::open(dir.path()).unwrap();
+    assert_eq!(recording.keyframe(2).unwrap().points[7], [7.0, -1.0, 2.0]);
+    let told = recording.check_clouds().unwrap().told();
+    let [told] = &told[..] else { panic!("{told:?}") };
+    assert!(told.contains("000000.bin (and 3 more files): five numbers a point"), "{told}");
+}
+
+#[test]
 fn a_folder_of_recordings_needs_two_robots_of_different_names() {
     let dir = tempfile::tempdir().unwrap();
     write_good(&dir.path().join("one"), "beta");

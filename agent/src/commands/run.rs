@@ -7,7 +7,7 @@ use crate::host::{Host, Options};
 use crate::link::scouting::Scouting;
 use crate::link::session::{self, LinkError};
 use crate::queue::{Drops, Inbox};
-use crate::recording::Recording;
+use crate::recording::{Recording, Remarks};
 use crate::telemetry;
 use anyhow::{Context, Result};
 use merganser_protocol::agent::io::{Command, Input};
@@ -198,8 +198,14 @@ async fn play(inbox: &Inbox, recording: Recording, speed: f64) -> Result<()> {
     let mut positions = positions.into_iter().peekable();
     let (sender, mut keyframes) = mpsc::channel(READ_AHEAD);
     let reader = tokio::task::spawn_blocking(move || {
-        for index in 0..recording.len() {
-            if sender.blocking_send(recording.keyframe(index)).is_err() {
+        let mut remarks = Remarks::default();
+        for (index, line) in recording.keyframes().iter().enumerate() {
+            let keyframe = recording.remarked(index).map(|(keyframe, odd)| {
+                let news = remarks.note(&recording.folder().join(&line.cloud), odd);
+                news.iter().for_each(|told| warn!("{told}"));
+                keyframe
+            });
+            if sender.blocking_send(keyframe).is_err() {
                 return; // the agent ends
             }
         }

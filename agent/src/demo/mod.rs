@@ -151,10 +151,11 @@ fn prepare(args: &DemoArgs, work: &Path) -> Result<(Vec<Recording>, Option<Bound
         return Ok((import::open_all(&folder)?, Some(Bounds { translation_m: 0.15, rotation_deg: 1.5 })));
     };
     let Prepared { recordings, remarks } = import::prepare(data, &folder, args.seed)?;
-    for remark in remarks {
-        let _ = console::Term::stderr().write_line(&format!("merganser: {}: {remark}", data.display()));
+    let warn = |text: String| drop(console::Term::stderr().write_line(&format!("merganser: {text}")));
+    remarks.into_iter().for_each(|remark| warn(format!("{}: {remark}", data.display())));
+    for recording in &recordings {
+        recording.check_clouds()?.told().into_iter().for_each(warn);
     }
-    recordings.iter().try_for_each(Recording::check_clouds)?;
     Ok((recordings, None))
 }
 
