@@ -80,6 +80,7 @@
 //! ```
 
 mod depth;
+mod diagnose;
 mod error;
 
 pub use depth::{CameraPose, Data, DepthEncoding, DepthMessage};
@@ -284,9 +285,10 @@ pub fn position(format: Format, bytes: &[u8]) -> Result<PositionSighting, Observ
 
 fn decode<T: DeserializeOwned>(format: Format, bytes: &[u8]) -> Result<T, ObservationError> {
     match format {
-        Format::Json => serde_json::from_slice(bytes).map_err(|e| ObservationError::Json(e.to_string())),
+        Format::Json => serde_json::from_slice(bytes).map_err(|error| diagnose::json(bytes, &error)),
         Format::Postcard => match postcard::take_from_bytes(bytes) {
             Ok((value, [])) => Ok(value),
+            _ if diagnose::is_json(bytes) => Err(ObservationError::Encoding),
             Ok((_, rest)) => Err(ObservationError::Trailing(rest.len())),
             Err(e) => Err(ObservationError::Postcard(e.to_string())),
         },

@@ -248,3 +248,62 @@ fn a_position_is_checked_too() {
     assert!(matches!(refused(&|m| m.covariance[5] = 0.0), ObservationError::Covariance(_)));
     assert!(matches!(refused(&|m| m.covariance[1] = 1.0), ObservationError::Covariance(_)));
 }
+
+#[test]
+fn what_a_first_user_sends_is_told_by_field_count_and_order() {
+    let good = r#"{"stamp_ns": 1, "translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "covariance": C, "points": [[1, 2, 3]]}"#;
+    let diagonal = |value: f64| {
+        let cells = (0..6).flat_map(|r| (r..6).map(move |c| if r == c { value } else { 0.0 }));
+        format!("{:?}", cells.collect::<Vec<_>>())
+    };
+    let good = good.replace('C', &diagonal(1e-4));
+    assert!(keyframe(Format::Json, good.as_bytes()).is_ok());
+    let told = |text: &str| keyframe(Format::Json, text.as_bytes()).unwrap_err().to_string();
+    let cases: [(&str, &str, &[&str]); 14] = [
+        ("[[1, 2, 3]]", "[[1, 2, 3, 0.5]]", &["points: [x, y, z] of each, not 4 numbers as points[0]", "intensity"]),
+        ("[[1, 2, 3]]", "[[1, 2, 3], [1, 2]]", &["not 2 numbers as points[1]"]),
+        ("[[1, 2, 3]]", "[1, 2, 3]", &["points: [x, y, z] of each, not a number"]),
+        ("[[1, 2, 3]]", "[[1, 2, NaN]]", &["points: every number must be finite", "points[0]"]),
+        ("[[1, 2, 3]]", "[[1, -Infinity, 2]]", &["points: every number must be finite"]),
+        ("[0, 0, 0]", "[0, 0]", &["translation: 3 numbers are wanted, not 2: x, y, z"]),
+        ("[0, 0, 0]", "[0, 0, NaN]", &["translation: every number must be finite"]),
+        ("[0, 0, 0]", "{\"x\": 0}", &["translation: 3 numbers are wanted: x, y, z"]),
+        ("[0, 0, 0]", "[\"0\", 0, 0]", &["translation: 3 numbers are wanted, not text"]),
+        ("[0, 0, 0, 1]", "[0, 0, 0]", &["rotation: 4 numbers are wanted, not 3: the quaternion x, y, z, w"]),
+        (
+            "\"stamp_ns\": 1",
+            "\"stamp_ns\": 1700000000.5",
+            &["stamp_ns: a whole number of nanoseconds, not 1700000000.5"],
+        ),
+        ("\"points\"", "\"session\": NaN, \"points\"", &["session: every number must be finite"]),
+        ("\"points\"", "\"colour\": 1, \"points\"", &["unknown field `colour`", "line 1"]),
+        ("\"translation\"", "\"position\"", &["position"]),
+    ];
+    for (from, to, parts) in cases {
+        let told = told(&good.replacen(from, to, 1));
+        assert!(parts.iter().all(|part| told.contains(part)), "{to}: {told}");
+    }
+    let whole = format!("{:?}", [1e-4; 36]);
+    let square = format!("{:?}", [[1e-4; 6]; 6]);
+    let want = "covariance: 21 numbers are wanted, not 36: the upper triangle of the 6×6 matrix row by row";
+    assert!(told(&good.replace(&diagonal(1e-4), &whole)).contains(want));
+    assert!(told(&good.replace(&diagonal(1e-4), &square)).contains("not lists; write them in one list: the upper"));
+    // A position's is of its place alone; text that holds the words of numbers is left alone.
+    let seen = r#"{"stamp_ns": 1, "robot": "b", "position": [1, 2, 3], "covariance": [1, 0, 0, 1, 0, 0, 0, 1]}"#;
+    let seen = position(Format::Json, seen.as_bytes()).unwrap_err().to_string();
+    assert!(seen.contains("covariance: 6 numbers are wanted, not 8: the upper triangle of the 3×3"), "{seen}");
+    let text = good.replace("\"points\"", r#""place": {"model": "NaN \" Infinity", "metric": "x"}, "points""#);
+    assert!(told(&text).contains("unknown variant `x`"), "{}", told(&text));
+    // Sent without an encoding, which says postcard.
+    for json in [good.clone(), format!(" \n{}", good.replace("[[1, 2, 3]]", "[[NaN, 2, 3]]"))] {
+        for error in [
+            keyframe(Format::Postcard, json.as_bytes()).unwrap_err(),
+            sighting(Format::Postcard, json.as_bytes()).unwrap_err(),
+            position(Format::Postcard, json.as_bytes()).unwrap_err(),
+        ] {
+            assert_eq!(error, ObservationError::Encoding);
+            assert!(error.to_string().starts_with("this looks like JSON: state the encoding application/json"));
+        }
+    }
+    assert!(matches!(keyframe(Format::Postcard, b"{1, 2}").unwrap_err(), ObservationError::Postcard(_)));
+}

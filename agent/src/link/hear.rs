@@ -85,7 +85,8 @@ fn question(shared: &Shared, tokens: &AtomicU64, kind: QueryKind, query: Query) 
 
 fn own(shared: &Shared, input: &'static str, sample: &Sample) {
     let Some(format) = format_of(sample.encoding()) else {
-        return shared.drops().count(format!("refused: in/{input} is neither application/json nor octet-stream"));
+        let (stated, cure) = (sample.encoding(), "state application/json, or application/octet-stream for postcard");
+        return refuse(shared, input, "the encoding", &format!("the encoding {stated} is not read; {cure}"));
     };
     let (length, limit) = (sample.payload().len(), shared.input_bytes_max);
     if length > limit {

@@ -12,6 +12,12 @@ pub enum ObservationError {
     /// Not the JSON wanted.
     #[error("JSON: {0}")]
     Json(String),
+    /// JSON that is said to be postcard.
+    #[error(
+        "this looks like JSON: state the encoding application/json, in Python \
+         put(key, text, encoding=zenoh.Encoding.APPLICATION_JSON); without one a message is taken for postcard"
+    )]
+    Encoding,
     /// Not the postcard wanted.
     #[error("postcard: {0}; the fields are those of the JSON form, in its order")]
     Postcard(String),
