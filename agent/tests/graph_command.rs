@@ -236,3 +236,65 @@ fn a_split_graph_keeps_what_is_fixed() {
     assert_eq!((code, said.as_str()), (0, "6 poses shared among 2 robots, 2 measurements between them\n"));
     assert!(read(at, "s.g2o").contains(&format!("FIX {}\n", robots_pose(b'b', 0))));
 }
+
+/// `n` steps along x from 0 on, with or without the poses.
+fn chain(first: u64, n: u64, length: f64, with_poses: bool) -> String {
+    let poses = (0..=n).filter(|_| with_poses).map(|k| vertex(first + k, k as f64 * length));
+    poses.chain((0..n).map(|k| edge(first + k, first + k + 1, length, "100"))).collect()
+}
+
+#[test]
+fn robots_that_number_alike_are_told_apart_by_the_cure() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    for with_poses in [false, true] {
+        for letter in [0, b'x'] {
+            let first = robots_pose(letter, 0);
+            std::fs::write(at.join("A.g2o"), chain(first, 3, 1.0, with_poses)).unwrap();
+            std::fs::write(at.join("B.g2o"), chain(first, 2, 2.0, with_poses)).unwrap();
+            for how in ["", " --robust"] {
+                let (code, _, told) = graph(at, &format!("solve A.g2o B.g2o --tum t.tum{how}"));
+                assert!(code == 1 && !at.join("t.tum").exists(), "{told}");
+                let place = if with_poses { "B.g2o:2: states" } else { "B.g2o:1: measures" };
+                let names = if letter == 0 { "the ids 0 to 2" } else { "(x0) to " };
+                for part in [place, "otherwise than A.g2o:", names, "letter", "graph split B.g2o --robots 1 --first"] {
+                    assert!(told.contains(part), "{part}: {told}");
+                }
+            }
+            let (code, said, told) = graph(at, "split B.g2o --robots 1 --first b --out b.g2o");
+            assert_eq!((code, told.as_str()), (0, ""), "{said}");
+            assert!(read(at, "b.g2o").contains(&format!("{} {}", robots_pose(b'b', 0), robots_pose(b'b', 1))));
+            let (code, said, told) = graph(at, "solve A.g2o b.g2o --tum t.tum");
+            assert_eq!((code, told.as_str()), (0, ""), "{said}");
+            // A file for each robot, and times that are the numbers of its poses.
+            let own = if letter == 0 { "t_0.tum" } else { "t_x.tum" };
+            let times = |name: &str| -> Vec<String> {
+                let text = read(at, name);
+                let lines = text.lines().filter(|line| !line.starts_with('#'));
+                lines.map(|line| line.split(' ').next().unwrap().to_owned()).collect()
+            };
+            assert_eq!(
+                (times(own), times("t_b.tum")),
+                (
+                    vec!["0", "1", "2", "3"].iter().map(|t| (*t).into()).collect(),
+                    vec!["0".into(), "1".into(), "2".into()]
+                )
+            );
+            assert_eq!(read(at, own).matches('#').count(), 1, "one part of the two");
+        }
+    }
+    assert_eq!(graph(at, "split A.g2o --robots 2 --first z --out no.g2o").0, 1);
+    assert_eq!(graph(at, "split A.g2o --robots 2 --first 1 --out no.g2o").0, 2);
+}
+
+#[test]
+fn robots_that_number_in_different_strides_are_doubted() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let strided = |stride: u64| (0..6).map(|k| edge(k * stride, (k + 1) * stride, 1.0, "100")).collect::<String>();
+    std::fs::write(at.join("A.g2o"), strided(2)).unwrap();
+    std::fs::write(at.join("B.g2o"), strided(3)).unwrap();
+    let (code, _, told) = graph(at, "solve A.g2o B.g2o");
+    assert_eq!((code, told.lines().count()), (0, 1), "{told}");
+    assert!(told.contains("A.g2o, B.g2o: several of these files use 3 ids from 0 to 12, without"), "{told}");
+}

@@ -4,6 +4,7 @@ use super::read::{self, Source};
 use super::write::write;
 use super::{SplitArgs, counted, say};
 use anyhow::{Context, Result, bail};
+use merganser_protocol::estimate::posegraph::g2o::number_of;
 use merganser_protocol::estimate::posegraph::robust::robot_of;
 use merganser_protocol::estimate::posegraph::{Measurement, PoseGraph, g2o};
 use std::collections::BTreeMap;
@@ -21,10 +22,17 @@ pub fn split(args: &SplitArgs) -> Result<bool> {
             counted(robots, "robot")
         );
     }
+    let letter = u64::from(u32::from(args.first));
+    if letter + robots as u64 > u64::from(b'z') + 1 {
+        bail!("--first {}: from there on the alphabet has no {}", args.first, counted(robots, "letter"));
+    }
+    let of_one = |id: &u64| graph.poses.keys().next().is_some_and(|first| robot_of(*first) == robot_of(*id));
+    let keep = robots == 1 && graph.poses.keys().all(of_one);
     let name = |(k, &id): (usize, &u64)| {
         let robot = k * robots / poses;
         let first = (robot * poses).div_ceil(robots);
-        (id, ((u64::from(b'a') + robot as u64) << 56) | (k - first) as u64)
+        let number = if keep { number_of(id) } else { (k - first) as u64 };
+        (id, ((letter + robot as u64) << 56) | number)
     };
     let names: BTreeMap<u64, u64> = graph.poses.keys().enumerate().map(name).collect();
     let renamed = |m: &Measurement| Measurement { i: names[&m.i], j: names[&m.j], ..m.clone() };

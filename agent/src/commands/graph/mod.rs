@@ -2,6 +2,7 @@
 
 mod change;
 mod fuse;
+mod identity;
 mod read;
 mod robust;
 mod solve;
@@ -65,7 +66,8 @@ pub struct SolveArgs {
     /// Write the solved graph as g2o: poses and all measurements, with --robust those that count.
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
-    /// Write the poses as a TUM trajectory, ids in place of times.
+    /// Write the poses as a TUM trajectory, in place of times the numbers of the poses: their ids without the robot's
+    /// letter. Where there are several robots, each has a file: for `--tum out.tum` they are out_a.tum, out_b.tum, …
     #[arg(long, value_name = "FILE")]
     pub tum: Option<PathBuf>,
     /// Write the poses with their covariances as CSV.
@@ -103,6 +105,10 @@ pub struct SplitArgs {
     /// Robots; each gets a run of consecutive poses.
     #[arg(long, value_parser = clap::value_parser!(u8).range(1..=26))]
     pub robots: u8,
+    /// The first robot's letter. With one robot, poses keep their numbers: so files of robots that all count from 0
+    /// become fit to be solved together.
+    #[arg(long, value_name = "LETTER", default_value = "a", value_parser = letter)]
+    pub first: char,
     /// The g2o file to write.
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
@@ -167,6 +173,13 @@ fn source_of(args: &SolveArgs) -> Result<Source> {
 fn share(text: &str) -> Result<f64, String> {
     let share = text.parse::<f64>().ok().filter(|share| (0.0..=1.0).contains(share));
     share.ok_or_else(|| "a share is a number from 0 to 1".to_owned())
+}
+
+fn letter(text: &str) -> Result<char, String> {
+    match text.as_bytes() {
+        [letter] if letter.is_ascii_lowercase() => Ok(char::from(*letter)),
+        _ => Err("a robot's letter is one from a to z".to_owned()),
+    }
 }
 
 /// "1 part", "2 parts".

@@ -1,10 +1,10 @@
 //! Graphs and tables from files, and errors told by file and line.
 
-use super::{counted, warn};
+use super::{counted, identity, warn};
 use anyhow::{Context, Error, Result, anyhow, bail};
 use merganser_protocol::estimate::posegraph::PoseGraph;
 use merganser_protocol::estimate::posegraph::fault::{PoseGraphError, PoseName};
-use merganser_protocol::estimate::posegraph::g2o::{LINE_MAX, Parser};
+use merganser_protocol::estimate::posegraph::g2o::{Fault, G2oError, LINE_MAX, Parser, Stated};
 use merganser_protocol::estimate::posegraph::kimera::Importer;
 use merganser_protocol::estimate::posegraph::lines::Files;
 use merganser_protocol::estimate::posegraph::marginals::{Marginal, Reader};
@@ -27,11 +27,22 @@ impl Source {
         let mut parser = Parser::default();
         for path in files {
             parser.begin();
+            let mut otherwise = None;
             for line in lines(path)? {
-                parser
-                    .line(&line.with_context(|| path.display().to_string())?)
-                    .map_err(|e| at(path, e.line, e.what))?;
+                match parser.line(&line.with_context(|| path.display().to_string())?) {
+                    // The rest of the file tells which poses both have.
+                    Err(G2oError { line, what: Fault::Otherwise(ends, first) }) => {
+                        otherwise.get_or_insert((line, Stated(ends), first));
+                    }
+                    other => other.map_err(|e| at(path, e.line, e.what))?,
+                }
             }
+            if let Some((line, stated, first)) = otherwise {
+                return Err(at(path, line, identity::two_robots(&parser, files, path, stated, first)));
+            }
+        }
+        if let Some(doubt) = identity::doubt(&parser, files) {
+            warn(&doubt);
         }
         let (lines, repeated) = (parser.files().clone(), parser.repeated());
         let graph = parser.finish();

@@ -4,11 +4,12 @@ use super::{SolveArgs, counted};
 use anyhow::{Context, Result};
 use merganser_protocol::estimate::posegraph::fault::PoseName;
 use merganser_protocol::estimate::posegraph::marginals::{self, Marginal};
+use merganser_protocol::estimate::posegraph::robust::robot_of;
 use merganser_protocol::estimate::posegraph::{PoseGraph, g2o};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A connected part that was solved.
 pub struct Part {
@@ -26,13 +27,40 @@ pub fn write_parts(args: &SolveArgs, graph: &PoseGraph, parts: &[Part], keep: im
         write(path, &g2o_text(graph, parts, keep))?;
     }
     if let Some(path) = &args.tum {
-        write(path, &told_apart(parts, |part| g2o::write_tum(&part.poses)))?;
+        for (path, text) in tum_texts(path, parts) {
+            write(&path, &text)?;
+        }
     }
     if let Some(path) = &args.marginals {
         let rows: Vec<Marginal> = parts.iter().flat_map(rows).collect();
         write(path, &marginals::write(&rows))?;
     }
     Ok(())
+}
+
+/// TUM trajectories, a file for each robot: one robot's numbers rise, several robots' repeat.
+fn tum_texts(path: &Path, parts: &[Part]) -> Vec<(PathBuf, String)> {
+    let robots: BTreeSet<u8> = parts.iter().flat_map(|part| part.poses.keys().map(|id| robot_of(*id))).collect();
+    let text = |robot: u8| {
+        told_apart(parts, |part| g2o::write_tum(part.poses.iter().filter(|(id, _)| robot_of(**id) == robot)))
+    };
+    robots.iter().map(|&robot| (tum_path(path, robot, robots.len()), text(robot))).collect()
+}
+
+/// Where a robot's trajectory goes: beside those of the others, by its letter.
+fn tum_path(path: &Path, robot: u8, robots: usize) -> PathBuf {
+    if robots < 2 {
+        return path.into();
+    }
+    let letter = char::from(robot);
+    let whose = if letter.is_ascii_alphabetic() { letter.to_string() } else { robot.to_string() };
+    let mut name = path.file_stem().unwrap_or_default().to_os_string();
+    name.push(format!("_{whose}"));
+    if let Some(ending) = path.extension() {
+        name.push(".");
+        name.push(ending);
+    }
+    path.with_file_name(name)
 }
 
 fn rows(part: &Part) -> impl Iterator<Item = Marginal> {
@@ -67,15 +95,16 @@ fn g2o_text(graph: &PoseGraph, parts: &[Part], keep: impl Fn(usize) -> bool) -> 
     out
 }
 
-/// Each part's text, below a comment that names it if there are several.
+/// Each part's text, if there is any, below a comment that names it if there are several parts.
 fn told_apart(parts: &[Part], mut text: impl FnMut(&Part) -> String) -> String {
     let mut out = String::new();
     for (k, part) in parts.iter().enumerate() {
-        if parts.len() > 1 {
+        let text = text(part);
+        if parts.len() > 1 && !text.is_empty() {
             let (poses, origin) = (counted(part.poses.len(), "pose"), PoseName(part.origin));
             let _ = writeln!(out, "# part {} of {}: {poses}, placed by {origin}", k + 1, parts.len());
         }
-        out.push_str(&text(part));
+        out.push_str(&text);
     }
     out
 }

@@ -5,19 +5,25 @@
 //! spatial ones that hold the plane: their information out of the plane is as large as the largest within it, and its
 //! value does not matter to the estimate, because nothing in the plane pulls out of it.
 
+use super::fault::PoseName;
+use super::identity::Owners;
+pub use super::identity::Shared;
 use super::lines::{Files, without_mark};
 use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_weights, printed_matrix};
 use crate::geometry::so3::So3;
 use crate::geometry::{Se3, se3};
 use crate::ids::Hash;
+use core::fmt;
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
-use std::fmt::Write;
+use std::fmt::Write as _;
 use thiserror::Error;
 
 /// Longest line, in bytes.
 pub const LINE_MAX: usize = 4096;
+/// Largest number that a pose has among its robot's.
+pub const NUMBER_MAX: u64 = (1 << 56) - 1;
 /// How far a quaternion's norm may be from 1 before it is no rounding.
 const QUATERNION_NORM_SLACK: f64 = 1e-2;
 /// Longest coordinate, m: beyond it a double does not tell a tenth of a millimetre, and squares soon overflow.
@@ -70,6 +76,13 @@ pub enum Fault {
     /// A pose told twice.
     #[error("pose {0} is told twice, with two values; leave one out")]
     Twice(u64),
+    /// Another file states otherwise what one robot alone states.
+    #[error(
+        "{} otherwise than an earlier file: two robots that number their poses alike? Give each robot's ids a letter \
+         of its own in the top byte; parts of one robot's graph put into one file",
+        Stated(*.0)
+    )]
+    Otherwise([u64; 2], usize),
     /// Planar and spatial lines in one file.
     #[error("mixes planar and spatial lines; keep to one of SE2 and SE3:QUAT")]
     Mixed,
@@ -88,6 +101,19 @@ pub enum Fault {
     /// Too many measurements.
     #[error("more than {MEASUREMENTS_MAX} measurements; split the graph")]
     Measurements,
+}
+
+/// What a line states, by its two poses; a value has its pose for both.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stated(pub [u64; 2]);
+
+impl fmt::Display for Stated {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            [i, j] if i == j => write!(f, "states {}", PoseName(i)),
+            [i, j] => write!(f, "measures {} from {}", PoseName(j), PoseName(i)),
+        }
+    }
 }
 
 /// Measurements that a file repeats to the bit. Each counts, as if it had been made so often.
@@ -109,6 +135,7 @@ pub struct Parser {
     /// The first of the measurements that are equal, by their [`digest`].
     seen: BTreeMap<[u8; 16], usize>,
     repeated: Option<Repeated>,
+    owners: Owners,
     planar: Option<bool>,
 }
 
@@ -117,6 +144,7 @@ impl Parser {
     /// files of both; what an earlier file holds to the bit is not taken again.
     pub fn begin(&mut self) {
         self.files.begin();
+        self.owners.begin();
         self.earlier = self.graph.measurements.len();
     }
 
@@ -137,6 +165,12 @@ impl Parser {
     /// Whether a file holds a measurement more than once.
     pub fn repeated(&self) -> Option<Repeated> {
         self.repeated
+    }
+
+    /// Of a robot (the top byte of its poses' ids, 0 where there is no letter), the poses of which several files say
+    /// something. They are taken for the same.
+    pub fn shared(&self, robot: u8) -> Option<Shared> {
+        self.owners.shared(robot)
     }
 
     /// The graph so far.
@@ -194,10 +228,16 @@ impl Parser {
 
     fn pose(&mut self, id: u64, value: Se3, planar: bool) -> Result<(), Fault> {
         self.of_kind(planar)?;
-        if self.graph.poses.get(&id).is_some_and(|known| known.is_some_and(|known| known != value)) {
-            return Err(Fault::Twice(id));
-        }
         self.room_for(&[id])?;
+        let earlier = self.owners.value(id, self.files.last());
+        match self.graph.poses.get(&id).copied().flatten() {
+            Some(known) if known == value => return Ok(()),
+            Some(_) => {
+                self.owners.name(&[id]);
+                return Err(earlier.map_or(Fault::Twice(id), |line| Fault::Otherwise([id, id], line)));
+            }
+            None => self.owners.name(&[id]),
+        }
         self.graph.poses.insert(id, Some(value));
         Ok(())
     }
@@ -218,14 +258,20 @@ impl Parser {
             return Err(Fault::Measurements);
         }
         self.room_for(&[i, j])?;
-        self.graph.poses.entry(i).or_default();
-        self.graph.poses.entry(j).or_default();
         let (seen, line) = (self.seen.entry(digest([i, j], &t_i_j, &information)), self.files.last());
+        if matches!(&seen, Entry::Occupied(first) if *first.get() < self.earlier) {
+            return Ok(());
+        }
+        self.owners.name(&[i, j]);
+        if let Some(earlier) = self.owners.measurement([i, j], line) {
+            return Err(Fault::Otherwise([i, j], earlier));
+        }
         match seen {
-            Entry::Occupied(first) if *first.get() < self.earlier => return Ok(()),
             Entry::Occupied(_) => self.repeated.get_or_insert(Repeated { count: 0, line }).count += 1,
             Entry::Vacant(first) => _ = first.insert(self.graph.measurements.len()),
         }
+        self.graph.poses.entry(i).or_default();
+        self.graph.poses.entry(j).or_default();
         self.graph.measurements.push(Measurement { i, j, t_i_j, printed, information, kappa, tau, line });
         Ok(())
     }
@@ -355,13 +401,19 @@ pub fn write(graph: &PoseGraph) -> String {
     out
 }
 
-/// Poses as a TUM trajectory, the id in place of the time.
+/// Poses of one robot as a TUM trajectory, in place of the time the number of the pose: its id without the robot's
+/// byte, with which it would be no number that a double holds.
 pub fn write_tum<'a>(poses: impl IntoIterator<Item = (&'a u64, &'a Se3)>) -> String {
     let mut out = String::new();
     for (id, value) in poses {
-        let _ = writeln!(out, "{id} {}", pose_numbers(value));
+        let _ = writeln!(out, "{} {}", number_of(*id), pose_numbers(value));
     }
     out
+}
+
+/// The number of a pose among its robot's: its id without the top byte.
+pub fn number_of(id: u64) -> u64 {
+    id & NUMBER_MAX
 }
 
 /// `x y z qx qy qz qw`.

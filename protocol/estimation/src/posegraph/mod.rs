@@ -6,6 +6,7 @@
 pub mod fault;
 pub mod g2o;
 mod gauge;
+mod identity;
 pub mod kimera;
 pub mod lines;
 pub mod marginals;

@@ -1,7 +1,7 @@
 //! Files, minima, certificates and covariances of pose graphs.
 
 use super::fault::{MeasurementFault, PoseGraphError};
-use super::g2o::{Fault, G2oError, LINE_MAX, Parser, Repeated, write, write_tum};
+use super::g2o::{Fault, G2oError, LINE_MAX, Parser, Repeated, Shared, write, write_tum};
 use super::kimera::{Importer, KimeraError, KimeraFault};
 use super::lines::Place;
 use super::solve::Start;
@@ -257,14 +257,15 @@ fn faults_name_their_line_and_what_to_do() {
 
 #[test]
 fn what_two_robots_files_both_hold_counts_once() {
-    let edge = "EDGE_SE2 0 1 1 0 0.1 1 0 0 1 0 1";
+    let name = |letter: u8, k: u64| (u64::from(letter) << 56) | k;
+    let measured = |angle: &str| format!("EDGE_SE2 {} {} 1 0 {angle} 1 0 0 1 0 1", name(b'a', 0), name(b'b', 1));
     let mut parser = Parser::default();
-    for line in [edge, edge, "EDGE_SE2 0 1 1 0 0.2 1 0 0 1 0 1"] {
+    for line in [&measured("0.1"), &measured("0.1"), &measured("0.2")] {
         parser.line(line).unwrap();
     }
     // Twice in one file is two measurements; again in another robot's file is none, and a third value is one.
     parser.begin();
-    for line in [edge, "EDGE_SE2 0 1 1 0 0.3 1 0 0 1 0 1"] {
+    for line in [&measured("0.1"), &measured("0.3")] {
         parser.line(line).unwrap();
     }
     assert_eq!(parser.line("nonsense").unwrap_err().line, 3);
@@ -274,6 +275,50 @@ fn what_two_robots_files_both_hold_counts_once() {
     assert_eq!(graph.measurements.iter().map(|m| m.line).collect::<Vec<_>>(), [1, 2, 3, 5]);
     let at = |file, line| Place { file, line };
     assert_eq!(places, [at(0, 1), at(0, 2), at(0, 3), at(1, 2)]);
+}
+
+/// Two files, read one after the other; what the second is refused for, and the poses that both name.
+fn two_files(first: &[String], second: &[String]) -> (Vec<G2oError>, Option<Shared>) {
+    let mut parser = Parser::default();
+    parser.begin();
+    first.iter().for_each(|line| parser.line(line).unwrap());
+    parser.begin();
+    let errors = second.iter().filter_map(|line| parser.line(line).err()).collect();
+    (errors, parser.shared(0))
+}
+
+proptest! {
+    #[test]
+    fn two_robots_that_number_alike_are_never_taken_for_one(n in 2_u64..30, m in 2_u64..30, with_poses: bool, turned: bool) {
+        let chain = |n: u64, y: f64| -> Vec<String> {
+            let pose = |k| format!("VERTEX_SE2 {k} {k} {y} 0");
+            let step = |k| {
+                let [i, j] = if turned && y > 0.0 { [k + 1, k] } else { [k, k + 1] };
+                format!("EDGE_SE2 {i} {j} 1 {y} 0 1 0 0 1 0 1")
+            };
+            (0..n).filter(|_| with_poses).map(pose).chain((0..n - 1).map(step)).collect()
+        };
+        let (errors, shared) = two_files(&chain(n, 0.0), &chain(m, 1.0));
+        let both = n.min(m);
+        let lines = both - 1 + if with_poses { both } else { 0 };
+        prop_assert_eq!(errors.len() as u64, lines);
+        prop_assert!(errors.iter().all(|e| matches!(e.what, Fault::Otherwise(..))), "{:?}", errors);
+        prop_assert_eq!(shared.map(|s| (s.first, s.last >= both - 1)), Some((0, true)));
+        // The same to the bit is the same robot, and no news.
+        prop_assert_eq!(two_files(&chain(n, 0.0), &chain(n, 0.0)), (vec![], None));
+        // With a letter each, they differ.
+        let letter = |line: &String| {
+            let words = line.split(' ').enumerate();
+            let is_id = |k: usize| k == 1 || k == 2 && line.starts_with('E');
+            let named = |word: &str| (word.parse::<u64>().unwrap() | u64::from(b'b') << 56).to_string();
+            words.map(|(k, word)| if is_id(k) { named(word) } else { word.into() }).collect::<Vec<_>>().join(" ")
+        };
+        let lettered: Vec<String> = chain(m, 1.0).iter().map(letter).collect();
+        prop_assert_eq!(two_files(&chain(n, 0.0), &lettered), (vec![], None));
+        // Closures of one robot in a file of their own.
+        let closure = format!("EDGE_SE2 0 {} 1 0 0 1 0 0 1 0 1", n + m);
+        prop_assert_eq!(two_files(&chain(n + m, 0.0), &[closure]).0, vec![]);
+    }
 }
 
 #[test]
@@ -340,6 +385,8 @@ fn kimera_tables_are_read_by_their_columns() {
 fn trajectories_are_written_as_tum() {
     let pose = Se3::new(So3::identity(), Vector3::new(1.0, 2.5, -3.0));
     assert_eq!(write_tum([(&7, &pose)]), "7 1 2.5 -3 0 0 0 1\n");
+    // A robot's letter is none of the time.
+    assert_eq!(write_tum([(&((u64::from(b'b') << 56) | 7), &pose)]), "7 1 2.5 -3 0 0 0 1\n");
 }
 
 /// A ring of poses c0 to c4, and c5 and c6 that hang on it by much too little.
