@@ -66,7 +66,7 @@ mod tests {
         for x in [0_i16, 1, -1, i16::MIN, i16::MAX, 258] {
             check(Scalar::Signed(1), &(x as i8).to_le_bytes(), f64::from(x as i8));
             check(Scalar::Signed(2), &x.to_le_bytes(), f64::from(x));
-            check(Scalar::Signed(4), &(i32::from(x) * 70_000).to_le_bytes(), f64::from(i32::from(x) * 70_000));
+            check(Scalar::Signed(4), &(i32::from(x) * 60_000).to_le_bytes(), f64::from(i32::from(x) * 60_000));
             check(Scalar::Signed(8), &(i64::from(x) << 33).to_le_bytes(), (i64::from(x) << 33) as f64);
             check(Scalar::Unsigned(1), &(x as u8).to_le_bytes(), f64::from(x as u8));
             check(Scalar::Unsigned(2), &(x as u16).to_le_bytes(), f64::from(x as u16));
