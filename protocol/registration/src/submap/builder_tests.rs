@@ -3,7 +3,7 @@ use super::*;
 use crate::config::Sensor;
 use crate::geometry::{Covariance, So3};
 use crate::submap::CovarianceOf;
-use nalgebra::Vector6;
+use nalgebra::{Vector3, Vector6};
 
 fn config() -> SubmapConfig {
     SubmapConfig { voxel_m: 0.1, distance_m: 2.0, rotation_deg: 60.0, keyframes_max: 10, ..Default::default() }
