@@ -191,3 +191,21 @@ fn a_lost_keyframe_widens_the_odometry_is_counted_and_told_once() {
     assert!(sigma > 0.1 * STEP && told == [Loss::Refused, Loss::Late] && gaps == 2, "{sigma} {told:?} {gaps}");
     assert_eq!(count.len(), 2);
 }
+
+/// An hour parked at 10 Hz: one submap that others can have, and a live pose that is no older than the last keyframe.
+#[test]
+fn a_parked_robot_states_one_submap_and_where_it_is() {
+    let mut wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: FIRST_EPOCH })]);
+    for k in 0..3600 {
+        let stamp = Stamp(1_000_000_000 + i64::from(k) * 100_000_000);
+        wires.input(0, Input::Keyframe(Keyframe { stamp, ..keyframe(1, 0.002 * f64::from(k % 2)) }));
+        if k % 100 == 99 {
+            wires.run(Duration::from_secs(10));
+        }
+    }
+    let seen = wires.agents[0].snapshot(wires.now);
+    assert_eq!((stated(&wires).len(), seen.status.keyframes, seen.path.keyframes.len()), (1, 3600, 10));
+    assert!((seen.poses.robots[0].stamp_secs - 360.9).abs() < 1e-6, "{}", seen.poses.robots[0].stamp_secs);
+    let t = seen.poses.robots[0].t_own_body.as_ref().unwrap();
+    assert!(t.sigmas[0] < 0.03, "{:?}", t.sigmas);
+}

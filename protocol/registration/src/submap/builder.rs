@@ -1,6 +1,7 @@
 //! Cuts a stream of keyframes into submaps. A submap ends with the keyframe that took the body `distance_m` or
 //! `rotation_deg` away from its first body pose, that is its `keyframes_max`-th, or that came `secs_max` after the
-//! first while the body did not merely stand; the next keyframe begins the next one. It ends before a motion that would
+//! first while the body did not merely stand; the next keyframe begins the next one, unless the body has stood since
+//! the submap's beginning: then the first that has left (see [`rest`](super::rest)). It ends before a motion that would
 //! let its last pose be uncertain by more than `sigma_max_m` or `sigma_max_deg`: so a hole in the odometry lies between
 //! submaps, where the joint estimate can mend it, and bends none. The odometry between consecutive anchors compounds
 //! every motion in between, so that they chain without gaps.
@@ -19,6 +20,7 @@ use super::odometry::{across_gap_after, isotropic, motion, motion_across};
 use super::open::{Open, moved};
 use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
+use super::rest::{NOISE_MAX, Rest, is_blurred, is_near};
 use super::runs::Runs;
 use super::thinning::Thinner;
 use super::{Keyframe, KeyframeError, Mark, PlaceDescriptor, PoseWithCovariance};
@@ -79,6 +81,8 @@ pub struct SubmapBuilder {
     /// The gap that the last accepted keyframe lies behind, if its motion had to be widened for it.
     crossed: Option<Loss>,
     arrivals: Arrivals,
+    /// The body has stood since the last finished submap began.
+    rest: Option<Rest>,
     /// Whether keyframes go on from one another.
     continuity: Continuity,
     /// What the front end calls its run, and what it called those that are over.
@@ -103,6 +107,7 @@ impl SubmapBuilder {
             gap: None,
             crossed: None,
             arrivals: Arrivals::default(),
+            rest: None,
             continuity: Continuity::default(),
             runs: Runs::default(),
             t_frame_body: Se3::identity(),
@@ -148,6 +153,11 @@ impl SubmapBuilder {
         self.continuity.take(&keyframe, &self.config);
         self.runs.take(keyframe.session);
         let step = self.step(&keyframe);
+        if step.as_ref().is_some_and(|step| self.stays(&keyframe, step)) {
+            self.keep(keyframe);
+            return Ok(None);
+        }
+        let step = self.leave(step);
         let step = self.taken(step, &keyframe);
         let ended = if step.as_ref().is_some_and(|step| self.would_blur(step)) { self.flush() } else { None };
         let Modality { planar, sharpens, .. } = Modality::of(self.config.sensor);
@@ -158,9 +168,55 @@ impl SubmapBuilder {
         };
         self.track(&keyframe, step);
         self.extend(&keyframe);
-        self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), place: None, ..keyframe });
+        self.keep(keyframe);
         // What was just begun is complete only where each keyframe is a submap, and there none was open.
-        Ok(if self.is_complete() { self.flush().or(ended) } else { ended })
+        Ok(if self.is_complete() { self.finish().or(ended) } else { ended })
+    }
+
+    /// Closes the open submap, which is complete; a body that did not move in it is at rest from now on.
+    fn finish(&mut self) -> Option<Submap> {
+        let stands = self.open.as_ref().is_some_and(|open| self.stands(open));
+        let closed = self.flush();
+        let at = self.last.as_ref().filter(|_| stands).map(|last| last.pose.pose);
+        self.rest = at.zip(self.since_finished).map(|(at, since)| Rest::new(at, self.t_frame_body, since));
+        closed
+    }
+
+    fn keep(&mut self, keyframe: Keyframe) {
+        self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), place: None, ..keyframe });
+    }
+
+    /// Whether the last keyframe said no more than that the body still stands: it is in no submap.
+    pub fn has_stood(&self) -> bool {
+        self.rest.as_ref().is_some_and(Rest::has_stood)
+    }
+
+    /// Whether the body still stands where it did when the last submap ended. If so, that is all that `keyframe` says.
+    fn stays(&mut self, keyframe: &Keyframe, step: &PoseWithCovariance) -> bool {
+        let Some(rest) = &mut self.rest else { return false };
+        if !rest.take(&keyframe.pose.pose, step, &self.config) {
+            return false;
+        }
+        if let Some(motion) = rest.motion(&keyframe.pose.pose, &self.config) {
+            let planar = Modality::of(self.config.sensor).planar;
+            let motion = if planar { flat_motion(&motion) } else { motion };
+            self.t_frame_body = rest.t_frame_body * motion.pose;
+            self.since_finished = Some(rest.since_finished.compose(&motion));
+        }
+        true
+    }
+
+    /// A body that stood moves on with this step: the motion since it came to stand.
+    fn leave(&mut self, step: Option<PoseWithCovariance>) -> Option<PoseWithCovariance> {
+        let left = self.rest.take().zip(self.last.as_ref());
+        let Some((rest, motion)) = left.and_then(|(rest, last)| {
+            let motion = rest.motion(&last.pose.pose, &self.config)?;
+            Some((rest, motion))
+        }) else {
+            return step;
+        };
+        (self.t_frame_body, self.since_finished) = (rest.t_frame_body, Some(rest.since_finished));
+        step.map(|step| motion.compose(&step))
     }
 
     /// Closes the open submap now, if it holds a keyframe.
@@ -387,25 +443,17 @@ impl SubmapBuilder {
 
     /// Whether the body stood all the time: it sees nothing new, and needs no submap to say so.
     fn stands(&self, open: &Open) -> bool {
-        let turn = STANDS_TURN * self.config.rotation_deg.to_radians();
-        let is_there = |t: &Se3| t.translation.norm() < self.config.voxel_m && t.rotation.angle() < turn;
-        open.keyframes.iter().all(is_there)
+        // Both ends of what was driven are known with the noise of a motion.
+        let mut there = open.keyframes.iter().skip(1).zip(&open.motions);
+        there.all(|(t, step)| is_near(t, &step.covariance, NOISE_MAX, &self.config))
     }
 
     /// Whether with this motion the open submap's last pose would be too uncertain in its first.
     fn would_blur(&self, step: &PoseWithCovariance) -> bool {
-        let Some(open) = &self.open else { return false };
-        let sigmas = open.gathered_with(step).covariance.sigmas();
-        // Out of the plane nothing is claimed to be known.
-        let axes: [&[usize]; 2] =
-            if self.config.sensor.is_planar() { [&[0, 1], &[5]] } else { [&[0, 1, 2], &[3, 4, 5]] };
-        let [way, turn] = axes.map(|axes| axes.iter().map(|&k| sigmas[k]).fold(0.0, f64::max));
-        way > self.config.sigma_max_m || turn > self.config.sigma_max_deg.to_radians()
+        let blurred = |open: &Open| is_blurred(&open.gathered_with(step).covariance, &self.config);
+        self.open.as_ref().is_some_and(blurred)
     }
 }
-
-/// A body that turns by less than this share of `rotation_deg`, and moves by less than a voxel, stands.
-const STANDS_TURN: f64 = 0.1;
 
 #[cfg(test)]
 #[path = "builder_tests.rs"]

@@ -35,6 +35,7 @@ pub mod planar;
 pub mod refine;
 mod refusal;
 pub mod register;
+mod rest;
 mod robust;
 pub mod runs;
 mod sampling;

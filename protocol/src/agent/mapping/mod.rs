@@ -95,7 +95,6 @@ impl Mapping {
     }
 
     fn taken(&mut self, pose: &Se3, stamp: Stamp) {
-        self.path.take(stamp, *pose);
         let last = self.last.replace((*pose, stamp));
         self.twist = last.and_then(|(last, at)| Twist::between(&last, pose, stamp.secs_since(at)));
     }
@@ -175,6 +174,9 @@ impl Mapping {
                 self.behind = None;
                 let gap = self.builder.take_gap();
                 gap.into_iter().for_each(|why| self.losses.cross(context, why));
+                if !self.builder.has_stood() {
+                    self.path.take(stamp, pose);
+                }
                 self.taken(&pose, stamp);
                 self.keyframes += 1;
                 self.keep_session(context, session);
