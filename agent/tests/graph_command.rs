@@ -275,10 +275,7 @@ fn robots_that_number_alike_are_told_apart_by_the_cure() {
             };
             assert_eq!(
                 (times(own), times("t_b.tum")),
-                (
-                    vec!["0", "1", "2", "3"].iter().map(|t| (*t).into()).collect(),
-                    vec!["0".into(), "1".into(), "2".into()]
-                )
+                (["0", "1", "2", "3"].iter().map(|t| (*t).into()).collect(), vec!["0".into(), "1".into(), "2".into()])
             );
             assert_eq!(read(at, own).matches('#').count(), 1, "one part of the two");
         }

@@ -201,7 +201,7 @@ pub(crate) mod tests {
             estimate: String::new(),
             submaps: 1,
             keyframes: 1,
-            keyframes_lost: std::collections::BTreeMap::new(),
+            keyframes_lost: BTreeMap::new(),
             gaps: 0,
             pending: 0,
             idle: true,

@@ -113,7 +113,7 @@ fn random(seed: u64, points: &[[f64; 3]]) -> Vec<u8> {
             let list = length.map_or(String::new(), |length| format!("list {} ", KINDS[length].0));
             head += &format!("property {list}{} {name}{end}", KINDS[*kind].0);
         }
-        for index in 0..count {
+        for point in (0..count).map(|index| points.get(index)) {
             let mut words = Vec::new();
             for (name, length, kind) in &properties {
                 let axis = ["x", "y", "z"].iter().position(|axis| axis == name).filter(|_| element == vertex);
@@ -121,7 +121,7 @@ fn random(seed: u64, points: &[[f64; 3]]) -> Vec<u8> {
                 if let Some(length) = length {
                     words.push((items as f64, *length));
                 }
-                words.extend((0..items).map(|_| (axis.map_or(7.0, |axis| points[index][axis]), *kind)));
+                words.extend((0..items).map(|_| (axis.zip(point).map_or(7.0, |(axis, point)| point[axis]), *kind)));
             }
             for (value, kind) in words {
                 let mut bytes = match KINDS[kind] {
