@@ -113,7 +113,7 @@ fn random(seed: u64, points: &[[f64; 3]]) -> Vec<u8> {
             let list = length.map_or(String::new(), |length| format!("list {} ", KINDS[length].0));
             head += &format!("property {list}{} {name}{end}", KINDS[*kind].0);
         }
-        for point in (0..count).map(|index| points.get(index)) {
+        for (index, point) in (0..count).map(|index| (index, points.get(index))) {
             let mut words = Vec::new();
             for (name, length, kind) in &properties {
                 let axis = ["x", "y", "z"].iter().position(|axis| axis == name).filter(|_| element == vertex);

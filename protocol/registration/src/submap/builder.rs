@@ -1,7 +1,7 @@
 //! Cuts a stream of keyframes into submaps. A submap ends with the keyframe that took the body `distance_m` or
 //! `rotation_deg` away from its first body pose, that is its `keyframes_max`-th, or that came `secs_max` after the
 //! first while the body did not merely stand; the next keyframe begins the next one, unless the body has stood since
-//! the submap's beginning: then the first that has left (see [`rest`](super::rest)). It ends before a motion that would
+//! the submap's beginning: then the first that has left (see `rest`). It ends before a motion that would
 //! let its last pose be uncertain by more than `sigma_max_m` or `sigma_max_deg`: so a hole in the odometry lies between
 //! submaps, where the joint estimate can mend it, and bends none. The odometry between consecutive anchors compounds
 //! every motion in between, so that they chain without gaps.
