@@ -16,7 +16,10 @@ use super::scaled::Scaled;
 
 /// What an alignment must add to a set's evidence to be one of it, as a logarithm: a hundredfold.
 const MEMBER_MIN: f64 = 4.6;
-/// Odds of being false from which a member is not used.
+/// What it must add to be used, more: near misses are more frequent than chance spread evenly...
+const USED_MIN: f64 = 6.5;
+/// ...unless so few contradict that the odds of its being false are no more than this all the same: what [`USED_MIN`]
+/// amounts to where as many do as agree.
 const FALSE_MAX: f64 = 0.1;
 /// A member of one set that adds as much to the other, to a hundredth, may be either's.
 const CONTESTED: f64 = 4.6;
@@ -110,7 +113,7 @@ impl Explanation {
         while set.count_ones() > 2 {
             let gains = clique::vertices(set).map(|l| (evidence.of_member(set, l), l));
             match gains.min_by(|a, b| a.0.total_cmp(&b.0)) {
-                Some((gain, l)) if odds_of_false(n, set, gain) > FALSE_MAX => set &= !bit(l),
+                Some((gain, l)) if gain < USED_MIN && odds_of_false(n, set, gain) > FALSE_MAX => set &= !bit(l),
                 _ => break,
             }
         }
