@@ -88,7 +88,12 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
     let Some(format) = format_of(sample.encoding()) else {
         lose(shared, input, Loss::Unreadable);
         let (stated, cure) = (sample.encoding(), "state application/json, or application/octet-stream for postcard");
-        return refuse(shared, input, "the encoding", &format!("the encoding {stated} is not read; {cure}"));
+        return refuse(
+            shared,
+            input,
+            "neither application/json nor octet-stream",
+            &format!("the encoding {stated} is not read; {cure}"),
+        );
     };
     let (length, limit) = (sample.payload().len(), shared.input_bytes_max);
     if length > limit {
