@@ -10,7 +10,7 @@ use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, Jo
 use merganser_protocol::agent::job::Job;
 use merganser_protocol::ids::{Hash, RobotId};
 use merganser_protocol::snapshot::Snapshot;
-use merganser_protocol::submap::Keyframe;
+use merganser_protocol::submap::{Keyframe, Loss};
 use merganser_protocol::time::Instant;
 use std::sync::Arc;
 use std::time::Duration;
@@ -202,12 +202,10 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
 
     fn handle(&mut self, input: Input) {
         let now = self.parts.clock.now();
-        let input = if self.parts.journal.is_some() { self.journalled(now, input) } else { Some(input) };
-        if let Some(input) = input {
-            self.inputs += 1;
-            self.parts.core.handle(now, input);
-            self.drain();
-        }
+        let input = if self.parts.journal.is_some() { self.journalled(now, input) } else { input };
+        self.inputs += 1;
+        self.parts.core.handle(now, input);
+        self.drain();
     }
 
     fn drain(&mut self) {
@@ -239,14 +237,14 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
 
     /// Writes the input down and gives back what the replay will see: a keyframe goes through its written form, so that
     /// both runs handle the same bits.
-    fn journalled(&mut self, now: Instant, input: Input) -> Option<Input> {
+    fn journalled(&mut self, now: Instant, input: Input) -> Input {
         let stored = StoredInput::from(&input);
         let input = match &stored {
             StoredInput::Keyframe(message) => match Keyframe::try_from((**message).clone()) {
                 Ok(keyframe) => Input::Keyframe(keyframe),
                 Err(reason) => {
                     warn!(%reason, "keyframe refused: it cannot be written to the journal");
-                    return None;
+                    return self.journalled(now, Input::KeyframesLost { why: Loss::Unreadable, count: 1 });
                 }
             },
             _ => input,
@@ -256,7 +254,7 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
             self.journal_flushed = now;
             self.with_journal(journal::Writer::flush);
         }
-        Some(input)
+        input
     }
 
     fn finish(mut self) -> Finished {
@@ -294,6 +292,13 @@ fn tell(event: &Event) {
             %frame,
             misfit_voxels,
             "views of one submap do not fit together: check the camera's intrinsics, units, extrinsics and the odometry"
+        ),
+        Event::OdometryGap { frame, why } => warn!(
+            %frame,
+            why = why.name(),
+            "keyframes {}: the motion across the gap counts as known to submap.gap_sigma_per_m only; further gaps of this \
+             kind are counted in view/status",
+            why.text()
         ),
         Event::SubmapFinished { submap, keypoints } => info!(%submap, keypoints, "submap finished"),
         Event::AlignmentAgreed { i, j } => info!(%i, %j, "alignment agreed"),

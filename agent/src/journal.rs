@@ -12,6 +12,7 @@ use merganser_protocol::agent::io::{
 use merganser_protocol::agent::{Identity, Restored};
 use merganser_protocol::config::Config;
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
+use merganser_protocol::submap::Loss;
 use merganser_protocol::time::Instant;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -144,6 +145,8 @@ pub enum StoredInput {
     Command(Command),
     /// See [`Input::Position`].
     Position(PositionSighting),
+    /// See [`Input::KeyframesLost`].
+    KeyframesLost(Loss, u64),
 }
 
 impl From<&Input> for StoredInput {
@@ -161,6 +164,7 @@ impl From<&Input> for StoredInput {
             Input::Timeout => Self::Timeout,
             Input::Command(command) => Self::Command(*command),
             Input::Position(sighting) => Self::Position(sighting.clone()),
+            Input::KeyframesLost { why, count } => Self::KeyframesLost(*why, *count),
         }
     }
 }
@@ -193,6 +197,7 @@ impl StoredInput {
             Self::Timeout => Input::Timeout,
             Self::Command(command) => Input::Command(command),
             Self::Position(sighting) => Input::Position(sighting),
+            Self::KeyframesLost(why, count) => Input::KeyframesLost { why, count },
         })))
     }
 }

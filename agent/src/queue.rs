@@ -4,7 +4,8 @@
 
 use merganser_protocol::agent::io::Input;
 use merganser_protocol::ids::Name;
-use std::collections::BTreeMap;
+use merganser_protocol::submap::Loss;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -38,6 +39,8 @@ pub struct Inbox {
     load: Arc<Load>,
     /// What was dropped, and why.
     pub drops: Arc<Drops>,
+    /// Keyframes that were lost since the last one that was taken and that the core was not told of.
+    lost: Arc<Mutex<BTreeMap<Loss, u64>>>,
 }
 
 /// The receiving end; the driver's.
@@ -45,6 +48,8 @@ pub struct Inbox {
 pub struct Outbox {
     outside: mpsc::Receiver<Queued>,
     inside: mpsc::UnboundedReceiver<Input>,
+    /// What comes before the input that was received last, then that input.
+    next: VecDeque<Input>,
 }
 
 #[derive(Debug)]
@@ -58,6 +63,8 @@ struct Load {
 #[derive(Debug)]
 struct Queued {
     input: Option<Input>,
+    /// Keyframes that were lost before it.
+    lost: BTreeMap<Loss, u64>,
     bytes: usize,
     load: Arc<Load>,
     of_source: Arc<AtomicUsize>,
@@ -75,25 +82,61 @@ pub fn queue(length: usize) -> (Inbox, Outbox) {
     let (outside, outside_end) = mpsc::channel(length.max(1));
     let (inside, inside_end) = mpsc::unbounded_channel();
     let load = Load { length_max: length, bytes: AtomicUsize::new(0), by_source: Mutex::default() };
-    let inbox = Inbox { outside, inside, load: Arc::new(load), drops: Arc::default() };
-    (inbox, Outbox { outside: outside_end, inside: inside_end })
+    let inbox = Inbox { outside, inside, load: Arc::new(load), drops: Arc::default(), lost: Arc::default() };
+    (inbox, Outbox { outside: outside_end, inside: inside_end, next: VecDeque::new() })
 }
 
 impl Inbox {
-    /// Puts an outside input into the queue, or drops and counts it. Returns whether it was taken. Never blocks.
+    /// Puts an outside input into the queue, or drops and counts it. Returns whether it was taken. Never blocks. Of
+    /// keyframes that are dropped the core hears before the next one.
     pub fn offer(&self, source: Source, input: Input) -> bool {
+        let is_keyframe = matches!(input, Input::Keyframe(_));
+        let lost = if is_keyframe { self.take_lost() } else { BTreeMap::new() };
+        let label = source.label().to_owned();
+        let Err(lost) = self.put(source, input, lost) else { return true };
+        lost.into_iter().for_each(|(why, count)| self.owe(why, count));
+        if is_keyframe {
+            self.owe(Loss::QueueFull, 1);
+        }
+        self.drops.count(format!("queue full: {label}"));
+        false
+    }
+
+    /// A keyframe of the robot's own was lost before it could become an input: the core hears of it in its place among
+    /// the others, at the latest with the next one. Never blocks, never fails.
+    pub fn lose(&self, why: Loss) {
+        self.owe(why, 1);
+        let lost = self.take_lost();
+        let mut lost = lost.into_iter();
+        while let Some((why, count)) = lost.next() {
+            if self.put(Source::Own, Input::KeyframesLost { why, count }, BTreeMap::new()).is_err() {
+                return std::iter::once((why, count)).chain(lost).for_each(|(why, count)| self.owe(why, count));
+            }
+        }
+    }
+
+    fn owe(&self, why: Loss, count: u64) {
+        *self.lost.lock().unwrap_or_else(PoisonError::into_inner).entry(why).or_default() += count;
+    }
+
+    fn take_lost(&self) -> BTreeMap<Loss, u64> {
+        std::mem::take(&mut *self.lost.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Puts an input behind what was lost before it; gives that back if there is no room.
+    fn put(&self, source: Source, input: Input, lost: BTreeMap<Loss, u64>) -> Result<(), BTreeMap<Loss, u64>> {
         let bytes = weight(&input);
         let of_source = self.load.of_source(&source);
-        let queued = Queued { input: Some(input), bytes, load: self.load.clone(), of_source: of_source.clone() };
+        let load = self.load.clone();
+        let mut queued = Queued { input: Some(input), lost, bytes, load, of_source: of_source.clone() };
         let before = of_source.fetch_add(1, Relaxed);
         let bytes_before = self.load.bytes.fetch_add(bytes, Relaxed);
         let share_max = if source == Source::Own { self.load.length_max } else { self.load.length_max / SHARE };
         let fits = before < share_max.max(1) && bytes_before + bytes <= QUEUED_BYTES_MAX;
-        let taken = fits && self.outside.try_send(queued).is_ok();
-        if !taken {
-            self.drops.count(format!("queue full: {}", source.label()));
+        if !fits {
+            return Err(std::mem::take(&mut queued.lost));
         }
-        taken
+        self.outside.try_send(queued).map_err(|refused| std::mem::take(&mut refused.into_inner().lost))
     }
 
     /// Waits for room, then puts an input of the robot's own into the queue. Returns false if the driver has ended.
@@ -105,7 +148,8 @@ impl Inbox {
         let of_source = self.load.of_source(&Source::Own);
         of_source.fetch_add(1, Relaxed);
         self.load.bytes.fetch_add(bytes, Relaxed);
-        let queued = Queued { input: Some(input), bytes, load: self.load.clone(), of_source };
+        let lost = if matches!(input, Input::Keyframe(_)) { self.take_lost() } else { BTreeMap::new() };
+        let queued = Queued { input: Some(input), lost, bytes, load: self.load.clone(), of_source };
         self.outside.send(queued).await.is_ok()
     }
 
@@ -121,7 +165,13 @@ impl Outbox {
         tokio::select! {
             biased;
             Some(input) = self.inside.recv() => Some(input),
-            Some(mut queued) = self.outside.recv() => queued.input.take(),
+            Some(input) = std::future::ready(self.next.pop_front()) => Some(input),
+            Some(mut queued) = self.outside.recv() => {
+                let lost = std::mem::take(&mut queued.lost).into_iter();
+                self.next.extend(lost.map(|(why, count)| Input::KeyframesLost { why, count }));
+                self.next.extend(queued.input.take());
+                self.next.pop_front()
+            }
             else => None,
         }
     }
@@ -201,7 +251,10 @@ impl Drops {
 mod tests {
     use super::*;
     use merganser_protocol::agent::io::{Channel, Command, QueryId};
+    use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
     use merganser_protocol::ids::RobotId;
+    use merganser_protocol::submap::{CovarianceOf, Keyframe};
+    use merganser_protocol::time::Stamp;
 
     fn robot(name: &str) -> Source {
         Source::Robot(Name::new(name).unwrap())
@@ -256,6 +309,47 @@ mod tests {
             assert!(matches!(outbox.next().await, Some(Input::Answered { query: QueryId(n), .. }) if n == number));
         }
         assert!(matches!(outbox.next().await, Some(Input::Received { .. })));
+    }
+
+    fn keyframe(stamp: i64) -> Input {
+        let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
+        Input::Keyframe(Keyframe {
+            stamp: Stamp(stamp),
+            session: None,
+            pose: PoseWithCovariance { pose: Se3::identity(), covariance },
+            covariance_of: CovarianceOf::Motion,
+            points: Vec::new(),
+            marks: Vec::new(),
+            place: None,
+            up: None,
+        })
+    }
+
+    /// A loss is told where it happened, be the queue full or not.
+    #[tokio::test]
+    async fn a_lost_keyframe_is_told_in_its_place_among_the_others() {
+        let (inbox, mut outbox) = queue(2);
+        let offered = [1, 2, 3, 4].map(|stamp| inbox.offer(Source::Own, keyframe(stamp)));
+        assert_eq!(offered, [true, true, false, false]);
+        inbox.lose(Loss::Unreadable); // there is no room to say so
+        let mut told = Vec::new();
+        let mut next = async |told: &mut Vec<String>| match outbox.next().await.unwrap() {
+            Input::Keyframe(keyframe) => told.push(keyframe.stamp.0.to_string()),
+            Input::KeyframesLost { why, count } => told.push(format!("{count} {}", why.name())),
+            other => panic!("{other:?}"),
+        };
+        next(&mut told).await;
+        assert!(inbox.offer(Source::Own, keyframe(5)));
+        next(&mut told).await;
+        inbox.lose(Loss::TooLarge);
+        for _ in 0..3 {
+            next(&mut told).await;
+        }
+        assert!(inbox.offer(Source::Own, keyframe(6)));
+        for _ in 0..2 {
+            next(&mut told).await;
+        }
+        assert_eq!(told, ["1", "2", "1 unreadable", "2 queue_full", "5", "1 too_large", "6"]);
     }
 
     #[tokio::test]

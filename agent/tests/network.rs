@@ -15,6 +15,7 @@ use merganser::store;
 use merganser_protocol::agent::io::{Channel, Command, Input, Output, QueryId, QueryKind, Record};
 use merganser_protocol::ids::RobotId;
 use merganser_protocol::snapshot::StatusView;
+use merganser_protocol::submap::Loss;
 use std::collections::BTreeMap;
 use std::time::Duration;
 use zenoh::Session;
@@ -212,6 +213,9 @@ async fn the_largest_keyframe_arrives_and_a_larger_one_is_told() {
     send(vec![b' '; configs[0].zenoh.input_bytes_max + 1], "application/json").await;
     until("the refusal of too many bytes", async || counted("in/keyframe: larger than zenoh.input_bytes_max")).await;
     assert!(!heard(POINTS_MAX + 1));
+    let lost =
+        |wanted: Loss| core.has_heard(|input| matches!(input, Input::KeyframesLost { why, .. } if *why == wanted));
+    until("the core to be told of both", async || lost(Loss::Unreadable) && lost(Loss::TooLarge)).await;
     session::close(&session, PATIENCE).await;
     alpha.stop().await.unwrap();
 }

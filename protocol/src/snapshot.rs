@@ -83,6 +83,12 @@ pub struct StatusView {
     pub submaps: u64,
     /// Keyframes taken.
     pub keyframes: u64,
+    /// Keyframes lost on their way, by cause.
+    #[serde(default)]
+    pub keyframes_lost: BTreeMap<String, u64>,
+    /// Motions across lost keyframes: known to `submap.gap_sigma_per_m` only.
+    #[serde(default)]
+    pub gaps: u64,
     /// Pairs of submaps still to be tried by this robot, jobs running, records not yet durable.
     pub pending: u64,
     /// Of these, what a restart would lose: submaps not yet stated, records not yet durable.

@@ -105,6 +105,8 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
             estimate: String::new(),
             submaps: 3,
             keyframes: KEYFRAMES as u64,
+            keyframes_lost: BTreeMap::new(),
+            gaps: 0,
             pending: 0,
             idle: true,
             merged_with: others(own),

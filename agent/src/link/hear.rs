@@ -8,6 +8,7 @@ use crate::observation::{self, Format};
 use crate::queue::Source;
 use merganser_protocol::agent::io::{AskToken, Channel, Input, QueryKind};
 use merganser_protocol::ids::{Name, RobotId};
+use merganser_protocol::submap::Loss;
 use merganser_protocol::wire::limits::{MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -85,6 +86,7 @@ fn question(shared: &Shared, tokens: &AtomicU64, kind: QueryKind, query: Query) 
 
 fn own(shared: &Shared, input: &'static str, sample: &Sample) {
     let Some(format) = format_of(sample.encoding()) else {
+        lose(shared, input, Loss::Unreadable);
         let (stated, cure) = (sample.encoding(), "state application/json, or application/octet-stream for postcard");
         return refuse(
             shared,
@@ -97,6 +99,7 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
     if length > limit {
         let reason =
             format!("larger than zenoh.input_bytes_max = {limit}: raise it (to 16777216 at most) or thin the data");
+        lose(shared, input, Loss::TooLarge);
         return refuse(shared, input, &reason, &format!("{length} bytes, {reason}"));
     }
     let bytes = sample.payload().to_bytes();
@@ -110,9 +113,17 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
             shared.inbox.offer(Source::Own, observed);
         }
         Err(reason) => {
+            lose(shared, input, Loss::Unreadable);
             let reason = reason.to_string();
             refuse(shared, input, first_words(&reason), &reason);
         }
+    }
+}
+
+/// A keyframe that the core will not see leaves a gap in the odometry, of which it must know. Other inputs leave none.
+fn lose(shared: &Shared, input: &str, why: Loss) {
+    if input == "keyframe" {
+        shared.inbox.lose(why);
     }
 }
 

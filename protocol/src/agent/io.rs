@@ -2,7 +2,7 @@
 
 use super::job::{Job, JobResult};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
-use crate::submap::Keyframe;
+use crate::submap::{Keyframe, Loss};
 use crate::time::Stamp;
 use serde::{Deserialize, Serialize};
 
@@ -48,6 +48,14 @@ pub struct JobId(pub u64);
 pub enum Input {
     /// The robot's own SLAM finished a keyframe.
     Keyframe(Keyframe),
+    /// Keyframes that the SLAM sent came to nothing in the shell, between the last [`Input::Keyframe`] and the next:
+    /// the motion to that one crosses a gap.
+    KeyframesLost {
+        /// By what.
+        why: Loss,
+        /// How many.
+        count: u64,
+    },
     /// The robot's own sensors measured another robot directly.
     Sighting(Sighting),
     /// Another robot was seen, but not how it is turned.
@@ -353,6 +361,14 @@ pub enum Event {
         submaps_gone: usize,
         /// Bytes of the entries before and after.
         bytes: [usize; 2],
+    },
+    /// Our odometry has a gap: keyframes were lost, and the motion across it counts as known to `gap_sigma_per_m` only.
+    /// Told once for each cause; `view/status` counts them all.
+    OdometryGap {
+        /// Our frame.
+        frame: FrameId,
+        /// What lost them.
+        why: Loss,
     },
     /// A new epoch, hence a new frame, began.
     EpochBegan {

@@ -136,6 +136,7 @@ impl Agent {
         self.context.reach(now);
         match input {
             Input::Keyframe(keyframe) => self.on_keyframe(keyframe),
+            Input::KeyframesLost { why, count } => self.mapping.lose(why, count),
             Input::Sighting(sighting) => self.on_sighting(&sighting),
             Input::Position(sighting) => self.on_position(&sighting),
             Input::Received { from, channel, bytes } => self.on_received(from, channel, &bytes),

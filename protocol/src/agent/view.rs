@@ -53,6 +53,8 @@ impl Agent {
             estimate: estimate_version::fingerprint(&self.context.config().estimate),
             submaps: self.alignment.own_submaps() as u64,
             keyframes: self.mapping.keyframes(),
+            keyframes_lost: self.mapping.losses().keyframes(),
+            gaps: self.mapping.losses().gaps(),
             pending,
             unsaved: self.unsaved(),
             idle: pending == 0 && settled,

@@ -5,7 +5,7 @@ use merganser_protocol::agent::Restored;
 use merganser_protocol::agent::io::{Command, EpochReason, Event, Input, Record};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use merganser_protocol::submap::continuity::RESTART_KEYFRAMES;
-use merganser_protocol::submap::{CovarianceOf, Keyframe};
+use merganser_protocol::submap::{CovarianceOf, Keyframe, Loss};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::entry::Entry;
 use merganser_protocol::wire::fact::{Fact, SubmapFact};
@@ -147,4 +147,66 @@ fn beyond_its_last_epoch_a_robot_that_restarts_is_only_refused() {
     }
     let status = wires.agents[0].status();
     assert_eq!((begun(&wires).len(), status.receive_only, status.keyframes), (1, true, 21));
+}
+
+/// Whatever lost a keyframe, the shell or the core: the motion across says so, it is counted, and told once.
+#[test]
+fn a_lost_keyframe_widens_the_odometry_is_counted_and_told_once() {
+    let lost = |inputs: Vec<Input>| {
+        let mut wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: FIRST_EPOCH })]);
+        inputs.into_iter().for_each(|input| {
+            wires.input(0, input);
+            wires.run(Duration::from_secs(1));
+        });
+        wires.input(0, Input::Command(Command::Flush));
+        let worst = |sigma: f64, (_, fact): &(u32, SubmapFact)| sigma.max(fact.odometry.covariance.sigmas()[0]);
+        let sigma = stated(&wires).iter().filter(|(_, fact)| fact.index > 0).fold(0.0, worst);
+        let told = |(_, event): &(usize, Event)| match event {
+            Event::OdometryGap { why, .. } => Some(*why),
+            _ => None,
+        };
+        let told: Vec<_> = wires.events.iter().filter_map(told).collect();
+        let status = wires.agents[0].snapshot(wires.now).status;
+        (sigma, told, status.gaps, status.keyframes_lost)
+    };
+    let all = || drive(1, 24).into_iter().map(Input::Keyframe).collect::<Vec<_>>();
+    let (sigma, told, gaps, count) = lost(all());
+    assert!(sigma < 4.0 * SIGMA && told.is_empty() && gaps == 0 && count.is_empty(), "{sigma} {told:?} {count:?}");
+    for why in [Loss::Unreadable, Loss::TooLarge, Loss::QueueFull] {
+        let mut inputs = all();
+        inputs.insert(16, Input::KeyframesLost { why, count: 2 });
+        inputs[12] = Input::KeyframesLost { why, count: 1 };
+        inputs.insert(0, Input::KeyframesLost { why, count: 1 }); // before the first there is no motion
+        let (sigma, told, gaps, count) = lost(inputs);
+        assert!(sigma > 0.1 * STEP && told == [why] && gaps == 2, "{why:?}: {sigma} {told:?} {gaps}");
+        assert_eq!(count.into_iter().collect::<Vec<_>>(), [(why.name().to_owned(), 4)]);
+    }
+    // Refused by the core, and late.
+    let mut inputs = all();
+    let mut bad = keyframe(13, STEP * 12.0);
+    bad.stamp = Stamp(i64::MAX);
+    inputs[12] = Input::Keyframe(bad);
+    inputs.insert(18, Input::Keyframe(Keyframe { stamp: Stamp(5_500_000_000), ..keyframe(19, 0.0) }));
+    let (sigma, told, gaps, count) = lost(inputs);
+    assert!(sigma > 0.1 * STEP && told == [Loss::Refused, Loss::Late] && gaps == 2, "{sigma} {told:?} {gaps}");
+    assert_eq!(count.len(), 2);
+}
+
+/// Six minutes parked at 10 Hz: one submap that others can have, and a live pose that is no older than the last keyframe.
+#[test]
+fn a_parked_robot_states_one_submap_and_where_it_is() {
+    let mut wires = Wires::new(vec![agent(0, Restored { records: vec![], fresh_epoch: FIRST_EPOCH })]);
+    for k in 0..3600 {
+        let stamp = Stamp(1_000_000_000 + i64::from(k) * 100_000_000);
+        wires.input(0, Input::Keyframe(Keyframe { stamp, ..keyframe(1, 0.002 * f64::from(k % 2)) }));
+        if k % 100 == 99 {
+            wires.run(Duration::from_secs(10));
+        }
+    }
+    let seen = wires.agents[0].snapshot(wires.now);
+    assert_eq!((stated(&wires).len(), seen.status.keyframes, seen.path.keyframes.len()), (1, 3600, 10));
+    assert!((seen.poses.robots[0].stamp_secs - 360.9).abs() < 1e-6, "{}", seen.poses.robots[0].stamp_secs);
+    let t = seen.poses.robots[0].t_own_body.as_ref().unwrap();
+    // Four motions to the anchor, five from there to the submap's end, and one for all the time since.
+    assert!((t.sigmas[0] - SIGMA * 10.0_f64.sqrt()).abs() < 1e-5, "{:?}", t.sigmas);
 }

@@ -201,6 +201,8 @@ pub(crate) mod tests {
             estimate: String::new(),
             submaps: 1,
             keyframes: 1,
+            keyframes_lost: BTreeMap::new(),
+            gaps: 0,
             pending: 0,
             idle: true,
             merged_with: frames.iter().filter_map(|(f, _)| f.split('/').next().map(str::to_owned)).collect(),

@@ -18,6 +18,9 @@ impl Trace {
     pub fn input(&mut self, now: Instant, robot: usize, input: &Input) {
         match input {
             Input::Keyframe(keyframe) => self.line(now, robot, "keyframe", &[&keyframe_digest(keyframe)]),
+            Input::KeyframesLost { why, count } => {
+                self.line(now, robot, "keyframes lost", &[why.name().as_bytes(), &count.to_le_bytes()]);
+            }
             Input::Sighting(s) => self.line(now, robot, "sighting", &[format!("{s:?}").as_bytes()]),
             Input::Position(s) => self.line(now, robot, "position", &[format!("{s:?}").as_bytes()]),
             Input::Received { from, channel, bytes } => {

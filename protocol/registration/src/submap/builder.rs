@@ -1,6 +1,7 @@
 //! Cuts a stream of keyframes into submaps. A submap ends with the keyframe that took the body `distance_m` or
 //! `rotation_deg` away from its first body pose, that is its `keyframes_max`-th, or that came `secs_max` after the
-//! first while the body did not merely stand; the next keyframe begins the next one. It ends before a motion that would
+//! first while the body did not merely stand; the next keyframe begins the next one, unless the body has stood since
+//! the submap's beginning: then the first that has left (see `rest`). It ends before a motion that would
 //! let its last pose be uncertain by more than `sigma_max_m` or `sigma_max_deg`: so a hole in the odometry lies between
 //! submaps, where the joint estimate can mend it, and bends none. The odometry between consecutive anchors compounds
 //! every motion in between, so that they chain without gaps.
@@ -10,20 +11,22 @@
 //! from the middle one only w/12; the joint estimate reckons with that (see `distortion` of the estimation).
 
 use super::continuity::{Continuity, FrameSign};
-use super::gravity::{self, Up};
-use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, adjust, flattened};
+use super::gravity::Up;
+use super::landmarks::{Constellation, Gatherer, SIGMA_RANGE, flattened};
+use super::loss::{Arrivals, Loss};
 use super::misfit::{Misfits, Views};
 use super::modality::Modality;
-use super::odometry::{across_gap_after, isotropic, motion};
+use super::odometry::{across_gap_after, isotropic, motion, motion_across};
+use super::open::{Open, moved};
 use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
+use super::rest::{NOISE_MAX, Rest, is_blurred, is_near};
 use super::runs::Runs;
 use super::thinning::Thinner;
 use super::{Keyframe, KeyframeError, Mark, PlaceDescriptor, PoseWithCovariance};
 use crate::config::{Gravity, SubmapConfig};
-use crate::geometry::{Covariance, Se3};
+use crate::geometry::Se3;
 use crate::time::Stamp;
-use nalgebra::{Matrix6, Vector3};
 
 /// Points in one keyframe at most: four times a dense depth image of 640×480.
 pub const POINTS_PER_KEYFRAME_MAX: usize = 1 << 20;
@@ -73,8 +76,13 @@ pub struct SubmapBuilder {
     /// Anchor of the last finished submap before a restart, until the first keyframe after it.
     resumed_at: Option<Se3>,
     open: Option<Open>,
-    /// A keyframe was refused since the last accepted one.
-    gap: bool,
+    /// Why the first keyframe was lost since the last accepted one, if one was.
+    gap: Option<Loss>,
+    /// The gap that the last accepted keyframe lies behind, if its motion had to be widened for it.
+    crossed: Option<Loss>,
+    arrivals: Arrivals,
+    /// The body has stood since the last finished submap began.
+    rest: Option<Rest>,
     /// Whether keyframes go on from one another.
     continuity: Continuity,
     /// What the front end calls its run, and what it called those that are over.
@@ -84,27 +92,6 @@ pub struct SubmapBuilder {
     sharpener: Sharpener,
     misfits: Misfits,
     misfit: Option<f64>,
-}
-
-#[derive(Clone, Debug)]
-struct Open {
-    stamps: [Stamp; 2],
-    /// `t_prev_first`, or `t_frame_first` for the first submap: the first body pose in the anchor before.
-    odometry: PoseWithCovariance,
-    t_frame_first: Se3,
-    /// Motion to each keyframe from the one before; none to the first.
-    motions: Vec<PoseWithCovariance>,
-    /// All of them compounded.
-    gathered: Option<PoseWithCovariance>,
-    /// `t_first_body` of each keyframe.
-    keyframes: Vec<Se3>,
-    /// About the first body pose, until it is known which is the middle one.
-    cloud: Thinner,
-    landmarks: Gatherer,
-    place: PlaceMean,
-    views: Views,
-    /// Which way each keyframe has up.
-    ups: Vec<Option<Up>>,
 }
 
 impl SubmapBuilder {
@@ -117,7 +104,10 @@ impl SubmapBuilder {
             since_finished: None,
             resumed_at: None,
             open: None,
-            gap: false,
+            gap: None,
+            crossed: None,
+            arrivals: Arrivals::default(),
+            rest: None,
             continuity: Continuity::default(),
             runs: Runs::default(),
             t_frame_body: Se3::identity(),
@@ -154,8 +144,7 @@ impl SubmapBuilder {
     /// [`KeyframeError`] if the keyframe is refused.
     pub fn push(&mut self, keyframe: Keyframe) -> Result<Option<Submap>, KeyframeError> {
         if let Err(error) = self.check(&keyframe) {
-            // A keyframe that is repeated, late or of another run is no loss; any other leaves a hole in the odometry.
-            self.gap |= !matches!(error, KeyframeError::StampNotRising { .. } | KeyframeError::SessionOver { .. });
+            self.loss(keyframe.stamp, &error).into_iter().for_each(|why| self.lose(why));
             if matches!(error, KeyframeError::Jump { .. }) {
                 self.continuity.refuse(&keyframe, &self.config);
             }
@@ -164,6 +153,12 @@ impl SubmapBuilder {
         self.continuity.take(&keyframe, &self.config);
         self.runs.take(keyframe.session);
         let step = self.step(&keyframe);
+        if step.as_ref().is_some_and(|step| self.stays(&keyframe, step)) {
+            self.keep(keyframe);
+            return Ok(None);
+        }
+        let step = self.leave(step);
+        let step = self.taken(step, &keyframe);
         let ended = if step.as_ref().is_some_and(|step| self.would_blur(step)) { self.flush() } else { None };
         let Modality { planar, sharpens, .. } = Modality::of(self.config.sensor);
         self.t_frame_body = match &step {
@@ -173,10 +168,55 @@ impl SubmapBuilder {
         };
         self.track(&keyframe, step);
         self.extend(&keyframe);
-        self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), place: None, ..keyframe });
-        self.gap = false;
+        self.keep(keyframe);
         // What was just begun is complete only where each keyframe is a submap, and there none was open.
-        Ok(if self.is_complete() { self.flush().or(ended) } else { ended })
+        Ok(if self.is_complete() { self.finish().or(ended) } else { ended })
+    }
+
+    /// Closes the open submap, which is complete; a body that did not move in it is at rest from now on.
+    fn finish(&mut self) -> Option<Submap> {
+        let stands = self.open.as_ref().is_some_and(|open| self.stands(open));
+        let closed = self.flush();
+        let at = self.last.as_ref().filter(|_| stands).map(|last| last.pose.pose);
+        self.rest = at.zip(self.since_finished).map(|(at, since)| Rest::new(at, self.t_frame_body, since));
+        closed
+    }
+
+    fn keep(&mut self, keyframe: Keyframe) {
+        self.last = Some(Keyframe { points: Vec::new(), marks: Vec::new(), place: None, ..keyframe });
+    }
+
+    /// Whether the last keyframe said no more than that the body still stands: it is in no submap.
+    pub fn has_stood(&self) -> bool {
+        self.rest.as_ref().is_some_and(Rest::has_stood)
+    }
+
+    /// Whether the body still stands where it did when the last submap ended. If so, that is all that `keyframe` says.
+    fn stays(&mut self, keyframe: &Keyframe, step: &PoseWithCovariance) -> bool {
+        let Some(rest) = &mut self.rest else { return false };
+        if !rest.take(&keyframe.pose.pose, step, &self.config) {
+            return false;
+        }
+        if let Some(motion) = rest.motion(&keyframe.pose.pose, &self.config) {
+            let planar = Modality::of(self.config.sensor).planar;
+            let motion = if planar { flat_motion(&motion) } else { motion };
+            self.t_frame_body = rest.t_frame_body * motion.pose;
+            self.since_finished = Some(rest.since_finished.compose(&motion));
+        }
+        true
+    }
+
+    /// A body that stood moves on with this step: the motion since it came to stand.
+    fn leave(&mut self, step: Option<PoseWithCovariance>) -> Option<PoseWithCovariance> {
+        let left = self.rest.take().zip(self.last.as_ref());
+        let Some((rest, motion)) = left.and_then(|(rest, last)| {
+            let motion = rest.motion(&last.pose.pose, &self.config)?;
+            Some((rest, motion))
+        }) else {
+            return step;
+        };
+        (self.t_frame_body, self.since_finished) = (rest.t_frame_body, Some(rest.since_finished));
+        step.map(|step| motion.compose(&step))
     }
 
     /// Closes the open submap now, if it holds a keyframe.
@@ -202,12 +242,32 @@ impl SubmapBuilder {
         self.misfit.take()
     }
 
+    /// A keyframe was lost: whatever came of it, the motion to the next one crosses a gap.
+    pub fn lose(&mut self, why: Loss) {
+        self.gap = self.gap.or(Some(why));
+    }
+
+    /// As what a keyframe with this stamp that is refused for this reason is lost. One that is repeated, or of a run
+    /// that is over, is no loss.
+    pub fn loss(&self, stamp: Stamp, error: &KeyframeError) -> Option<Loss> {
+        match error {
+            KeyframeError::SessionOver { .. } => None,
+            KeyframeError::StampNotRising { .. } => (!self.arrivals.has(stamp)).then_some(Loss::Late),
+            _ => Some(Loss::Refused),
+        }
+    }
+
+    /// By what loss, if by any, the motion to the last accepted keyframe was made less certain: said once.
+    pub fn take_gap(&mut self) -> Option<Loss> {
+        self.crossed.take()
+    }
+
     /// Passes over a keyframe that there is no room for. Where it is counts, so that what goes on from it later is
     /// known to go on; the odometry has a hole.
     pub fn pass(&mut self, keyframe: &Keyframe) {
         if self.check(keyframe).is_ok() {
             self.continuity.take(keyframe, &self.config);
-            self.gap = true;
+            self.lose(Loss::Overload);
         }
     }
 
@@ -272,9 +332,20 @@ impl SubmapBuilder {
         Ok(())
     }
 
-    /// The motion since the last keyframe, if there was one.
+    /// The motion since the last keyframe, if there was one, as the SLAM has it.
     fn step(&mut self, keyframe: &Keyframe) -> Option<PoseWithCovariance> {
-        let step = self.last.as_ref().map(|last| motion(last, keyframe, self.gap, &self.config));
+        let gap = self.gap.take();
+        let last = self.last.as_ref();
+        let gap = gap.or(last.filter(|last| self.arrivals.lack(last, keyframe)).map(|_| Loss::Unseen));
+        self.arrivals.take(last.filter(|_| gap.is_none()), keyframe, &self.config);
+        let last = last?;
+        let across = gap.and_then(|why| Some((why, motion_across(last, keyframe, &self.config)?)));
+        self.crossed = across.map(|(why, _)| why);
+        Some(across.map_or_else(|| motion(last, keyframe, &self.config), |(_, across)| across))
+    }
+
+    /// The motion as it is taken for the submaps.
+    fn taken(&mut self, step: Option<PoseWithCovariance>, keyframe: &Keyframe) -> Option<PoseWithCovariance> {
         match Modality::of(self.config.sensor) {
             Modality { sharpens: true, .. } => self.sharpener.sharpen(step, &keyframe.points, self.config.voxel_m),
             Modality { planar: true, .. } => step.as_ref().map(flat_motion),
@@ -372,100 +443,17 @@ impl SubmapBuilder {
 
     /// Whether the body stood all the time: it sees nothing new, and needs no submap to say so.
     fn stands(&self, open: &Open) -> bool {
-        let turn = STANDS_TURN * self.config.rotation_deg.to_radians();
-        let is_there = |t: &Se3| t.translation.norm() < self.config.voxel_m && t.rotation.angle() < turn;
-        open.keyframes.iter().all(is_there)
+        // Both ends of what was driven are known with the noise of a motion.
+        let mut there = open.keyframes.iter().skip(1).zip(&open.motions);
+        there.all(|(t, step)| is_near(t, &step.covariance, NOISE_MAX, &self.config))
     }
 
     /// Whether with this motion the open submap's last pose would be too uncertain in its first.
     fn would_blur(&self, step: &PoseWithCovariance) -> bool {
-        let Some(open) = &self.open else { return false };
-        let sigmas = open.gathered_with(step).covariance.sigmas();
-        // Out of the plane nothing is claimed to be known.
-        let axes: [&[usize]; 2] =
-            if self.config.sensor.is_planar() { [&[0, 1], &[5]] } else { [&[0, 1, 2], &[3, 4, 5]] };
-        let [way, turn] = axes.map(|axes| axes.iter().map(|&k| sigmas[k]).fold(0.0, f64::max));
-        way > self.config.sigma_max_m || turn > self.config.sigma_max_deg.to_radians()
+        let blurred = |open: &Open| is_blurred(&open.gathered_with(step).covariance, &self.config);
+        self.open.as_ref().is_some_and(blurred)
     }
 }
-
-impl Open {
-    /// The motion from the first keyframe to the one that this step leads to.
-    fn gathered_with(&self, step: &PoseWithCovariance) -> PoseWithCovariance {
-        self.gathered.map_or(*step, |gathered| gathered.compose(step))
-    }
-
-    /// Position of the keyframe that anchors the submap.
-    fn middle(&self) -> usize {
-        self.keyframes.len().saturating_sub(1) / 2
-    }
-
-    /// `t_first_anchor`.
-    fn t_first_anchor(&self) -> Se3 {
-        self.keyframes.get(self.middle()).copied().unwrap_or_else(Se3::identity)
-    }
-
-    /// `t_anchor_last`: the last body pose.
-    fn t_anchor_last(&self) -> PoseWithCovariance {
-        let last = self.keyframes.last().copied().unwrap_or_else(Se3::identity);
-        along(self.motions.iter().skip(self.middle()), self.t_first_anchor().inverse() * last)
-    }
-
-    fn close(self, index: u32) -> Submap {
-        let t_first_anchor = self.t_first_anchor();
-        let t_anchor_first = t_first_anchor.inverse();
-        let odometry = self.odometry_to_anchor();
-        let anchor = self.middle();
-        let keyframes: Vec<Se3> = self.keyframes.iter().map(|t_first_body| t_anchor_first * *t_first_body).collect();
-        let up = gravity::mean(&self.ups, &keyframes, &self.motions, anchor);
-        let constellation = adjust(&self.landmarks.finish(), &self.motions, &keyframes, anchor);
-        let (mut cloud, seen_from) = self.cloud.finish();
-        let about_anchor = |p: [f32; 3]| moved(&t_anchor_first, p.map(f64::from)).map(|x| x as f32);
-        cloud.iter_mut().for_each(|p| *p = about_anchor(*p));
-        cloud.extend(constellation.landmarks.iter().map(|l| <[f32; 3]>::from(l.at.map(|x| x as f32))));
-        Submap {
-            index,
-            stamps: self.stamps,
-            odometry,
-            t_frame_anchor: self.t_frame_first * t_first_anchor,
-            keyframes,
-            cloud,
-            seen_from,
-            constellation,
-            place: self.place.finish(),
-            up,
-        }
-    }
-
-    fn odometry_to_anchor(&self) -> PoseWithCovariance {
-        if self.middle() == 0 {
-            return self.odometry;
-        }
-        self.odometry.compose(&along(self.motions.iter().take(self.middle()), self.t_first_anchor()))
-    }
-}
-
-/// Compounds motions. Their mean is known better from the SLAM's poses than from the product, which drifts by rounding.
-fn along<'a>(motions: impl Iterator<Item = &'a PoseWithCovariance>, mean: Se3) -> PoseWithCovariance {
-    let compounded = motions.copied().reduce(|sum, motion| sum.compose(&motion));
-    let covariance = compounded.map_or_else(unmoved, |sum| sum.covariance);
-    PoseWithCovariance { pose: mean, covariance }
-}
-
-/// The covariance of no motion at all.
-fn unmoved() -> Covariance<6> {
-    Covariance::new_or_wider(Matrix6::from_diagonal_element(ZERO_SIGMA * ZERO_SIGMA))
-}
-
-fn moved(t: &Se3, p: [f64; 3]) -> [f64; 3] {
-    (*t * Vector3::from(p)).into()
-}
-
-/// A body that turns by less than this share of `rotation_deg`, and moves by less than a voxel, stands.
-const STANDS_TURN: f64 = 0.1;
-
-/// Stands for a standard deviation of zero: a body that did not move.
-const ZERO_SIGMA: f64 = 1e-8;
 
 #[cfg(test)]
 #[path = "builder_tests.rs"]

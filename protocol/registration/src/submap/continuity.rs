@@ -213,7 +213,7 @@ impl Continuity {
         if moved <= distance && turned <= rotation {
             return Step { moved, turned, secs, possible: distance, usual: distance, turn: rotation };
         }
-        let sigmas = motion(from, to, false, config).covariance.sigmas() * SIGMAS;
+        let sigmas = motion(from, to, config).covariance.sigmas() * SIGMAS;
         let [loose_m, loose_rad] = [0, 3].map(|k| sigmas.fixed_rows::<3>(k).max());
         let speed = match config.scale {
             ScaleKind::Metric => config.speed_max_m_s * secs,

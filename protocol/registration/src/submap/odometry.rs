@@ -17,23 +17,25 @@ const DERIVED_SIGMA_RAD: f64 = 1e-4;
 /// Turn assumed possible unnoticed across a gap of one submap's length, rad; scaled by `gap_sigma_per_m` as the rest.
 const GAP_TURN_PER_SUBMAP: f64 = 0.2;
 
-/// `t_last_next` with the covariance of its local perturbation; `gap` says that keyframes between the two were lost.
-pub fn motion(last: &Keyframe, next: &Keyframe, gap: bool, config: &SubmapConfig) -> PoseWithCovariance {
+/// `t_last_next` with the covariance of its local perturbation, if no keyframe between the two was lost.
+pub fn motion(last: &Keyframe, next: &Keyframe, config: &SubmapConfig) -> PoseWithCovariance {
     let pose = last.pose.pose.inverse() * next.pose.pose;
-    let reported = match (next.covariance_of, last.covariance_of) {
-        (CovarianceOf::Motion, _) => Some(next.pose.covariance),
-        (CovarianceOf::Pose, CovarianceOf::Pose) => Some(derived(last, next, &pose, config)),
-        (CovarianceOf::Pose, CovarianceOf::Motion) => None,
-    };
-    let covariance = match reported {
-        // Differences of poses span a gap by themselves; a motion covers only the last step of it.
-        Some(covariance) if gap && next.covariance_of == CovarianceOf::Motion => {
-            covariance.plus(&across_gap(&pose, config, &next.pose.covariance).covariance)
-        }
-        Some(covariance) => covariance,
-        None => across_gap(&pose, config, &next.pose.covariance).covariance,
+    let covariance = match (next.covariance_of, last.covariance_of) {
+        (CovarianceOf::Motion, _) => next.pose.covariance,
+        (CovarianceOf::Pose, CovarianceOf::Pose) => derived(last, next, &pose, config).0,
+        (CovarianceOf::Pose, CovarianceOf::Motion) => across_gap(&pose, config, &next.pose.covariance).covariance,
     };
     PoseWithCovariance { pose, covariance }
+}
+
+/// The same if some were lost. `None` where the covariance spans the gap by itself: differences of poses do, if they
+/// are a chain's; a motion's covers only the last step of it.
+pub fn motion_across(last: &Keyframe, next: &Keyframe, config: &SubmapConfig) -> Option<PoseWithCovariance> {
+    let PoseWithCovariance { pose, covariance } = motion(last, next, config);
+    let is_chain = (last.covariance_of, next.covariance_of) == (CovarianceOf::Pose, CovarianceOf::Pose)
+        && !derived(last, next, &pose, config).1;
+    let widened = || covariance.plus(&across_gap(&pose, config, &next.pose.covariance).covariance);
+    (!is_chain).then(|| PoseWithCovariance { pose, covariance: widened() })
 }
 
 /// A motion over which odometry is not known: σ = `gap_sigma_per_m` × (distance + one voxel) for the translation and
@@ -56,8 +58,8 @@ pub fn isotropic(rho: f64, phi: f64, otherwise: &Covariance<6>) -> Covariance<6>
 }
 
 /// Σ_M = Σ_next − Ad(M⁻¹) Σ_last Ad(M⁻¹)ᵀ: what compounding must have added, if the SLAM's poses form a chain. A loop
-/// closure between the two makes it indefinite, so it is raised to a floor in every direction.
-fn derived(last: &Keyframe, next: &Keyframe, t_last_next: &Se3, config: &SubmapConfig) -> Covariance<6> {
+/// closure between the two makes it indefinite, so it is raised to a floor in every direction. Whether it had to be.
+fn derived(last: &Keyframe, next: &Keyframe, t_last_next: &Se3, config: &SubmapConfig) -> (Covariance<6>, bool) {
     let ad = t_last_next.inverse().adjoint();
     let difference = next.pose.covariance.matrix() - ad * last.pose.covariance.matrix() * ad.transpose();
     let rho = DERIVED_SIGMA_PER_M * t_last_next.translation.norm() + DERIVED_SIGMA_VOXELS * config.voxel_m;
@@ -65,13 +67,15 @@ fn derived(last: &Keyframe, next: &Keyframe, t_last_next: &Se3, config: &SubmapC
     raised(&difference, &isotropic(rho, phi, &next.pose.covariance))
 }
 
-/// The smallest covariance that is at least `m` and at least `floor` in every direction of the floor's metric.
-fn raised(m: &Matrix6<f64>, floor: &Covariance<6>) -> Covariance<6> {
+/// The smallest covariance that is at least `m` and at least `floor` in every direction of the floor's metric; whether
+/// it is more than `m`.
+fn raised(m: &Matrix6<f64>, floor: &Covariance<6>) -> (Covariance<6>, bool) {
     let sigmas = floor.sigmas();
     let scaled = Matrix6::from_fn(|r, c| 0.5 * (m[(r, c)] + m[(c, r)]) / (sigmas[r] * sigmas[c]));
     let eigen = scaled.symmetric_eigen();
+    let is_below = eigen.eigenvalues.iter().any(|v| !v.is_finite() || *v < 1.0);
     let values = eigen.eigenvalues.map(|v| if v.is_finite() { v.max(1.0) } else { 1.0 });
     let lifted = eigen.eigenvectors * Matrix6::from_diagonal(&values) * eigen.eigenvectors.transpose();
     let m = Matrix6::from_fn(|r, c| 0.5 * (lifted[(r, c)] + lifted[(c, r)]) * sigmas[r] * sigmas[c]);
-    Covariance::new(m).unwrap_or(*floor)
+    (Covariance::new(m).unwrap_or(*floor), is_below)
 }

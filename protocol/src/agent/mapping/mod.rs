@@ -1,6 +1,7 @@
 //! The robot's own side: keyframes in, submaps cut and described one at a time, so that they are stated in order; and
 //! what its sensors tell of other robots. It has no timers: all that it does is called for by an input.
 
+mod losses;
 mod path;
 mod sighting;
 
@@ -18,11 +19,12 @@ use crate::ids::{Hash, SubmapId};
 use crate::snapshot::PathView;
 use crate::submap::continuity::FrameSign;
 use crate::submap::runs::Runs;
-use crate::submap::{Described, Keyframe, KeyframeError, Submap, SubmapBuilder};
+use crate::submap::{Described, Keyframe, KeyframeError, Loss, Submap, SubmapBuilder};
 use crate::time::{Instant, Stamp};
 use crate::wire::fact::{Fact, SubmapFact};
 use core::num::NonZero;
 use core::time::Duration;
+use losses::Losses;
 use path::Path;
 use sighting::Positions;
 use std::collections::VecDeque;
@@ -44,6 +46,7 @@ pub(super) struct Mapping {
     queue: VecDeque<(SubmapId, Submap)>,
     describing: Option<(JobId, SubmapId)>,
     keyframes: u64,
+    losses: Losses,
     path: Path,
     positions: Positions,
 }
@@ -77,6 +80,7 @@ impl Mapping {
             queue: VecDeque::new(),
             describing: None,
             keyframes: 0,
+            losses: Losses::default(),
             path: Path::default(),
             positions: Positions::default(),
         }
@@ -91,7 +95,6 @@ impl Mapping {
     }
 
     fn taken(&mut self, pose: &Se3, stamp: Stamp) {
-        self.path.take(stamp, *pose);
         let last = self.last.replace((*pose, stamp));
         self.twist = last.and_then(|(last, at)| Twist::between(&last, pose, stamp.secs_since(at)));
     }
@@ -116,6 +119,17 @@ impl Mapping {
         self.keyframes
     }
 
+    /// Keyframes lost, and the gaps that they left.
+    pub(super) fn losses(&self) -> &Losses {
+        &self.losses
+    }
+
+    /// Keyframes were lost before they came here.
+    pub(super) fn lose(&mut self, why: Loss, count: u64) {
+        self.builder.lose(why);
+        self.losses.lose(why, count);
+    }
+
     /// The last finished submap and the body's pose in its anchor.
     pub(super) fn body(&self) -> Option<(u32, PoseWithCovariance, Stamp)> {
         self.builder.body_since_anchor()
@@ -137,6 +151,7 @@ impl Mapping {
         if !has_room {
             let detail = format!("{DESCRIBE_QUEUE_MAX} submaps wait to be described; raise submap.distance_m");
             self.builder.pass(keyframe);
+            self.losses.lose(Loss::Overload, 1);
             context.reject(Some(context.robot()), "keyframe: overload", &detail);
         }
         has_room
@@ -157,6 +172,11 @@ impl Mapping {
         match self.builder.push(keyframe) {
             Ok(closed) => {
                 self.behind = None;
+                let gap = self.builder.take_gap();
+                gap.into_iter().for_each(|why| self.losses.cross(context, why));
+                if !self.builder.has_stood() {
+                    self.path.take(stamp, pose);
+                }
                 self.taken(&pose, stamp);
                 self.keyframes += 1;
                 self.keep_session(context, session);
@@ -165,6 +185,7 @@ impl Mapping {
             }
             Err(error) => {
                 context.reject(Some(context.robot()), "keyframe", &error.to_string());
+                self.builder.loss(stamp, &error).into_iter().for_each(|why| self.losses.lose(why, 1));
                 let is_behind = matches!(error, KeyframeError::StampNotRising { .. });
                 (is_behind && self.is_clock_back(context.now(), stamp)).then_some(EpochReason::ClockBack)
             }
