@@ -39,22 +39,10 @@ fn rejected(wires: &Wires, robot: usize) -> u64 {
 }
 
 #[test]
-fn bad_keyframes_and_sightings_are_counted_and_the_map_is_the_same() {
+fn bad_sightings_are_counted_and_the_map_is_the_same() {
     let honest = play(&recordings(), 1).unwrap();
-    let stream = recordings();
-    let meddled = play_with(&recordings(), 1, |wires, count| {
-        let good = stream[0].keyframe(0).unwrap();
-        let at =
-            |x: f64| PoseWithCovariance { pose: Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0)), ..good.pose };
-        // Older than anything, and NaN in points or pose beside it. None may leave a gap in the odometry.
-        let mut bad = good.clone();
-        bad.stamp = Stamp(i64::MIN);
-        match count % 3 {
-            0 => {}
-            1 => bad.points.push([f32::NAN; 3]),
-            _ => bad.pose = at(f64::NAN),
-        }
-        wires.input(0, Input::Keyframe(bad));
+    let good = recordings()[0].keyframe(0).unwrap();
+    let meddled = play_with(&recordings(), 1, |wires, _| {
         for (quaternion, variance) in [([0.0; 4], 1.0), ([f64::NAN; 4], 1.0), ([0.0, 0.0, 0.0, 1.0], -1.0)] {
             let [x, y, z, w] = quaternion;
             let covariance = core::array::from_fn(|k| if [0, 6, 11, 15, 18, 20].contains(&k) { variance } else { 0.0 });
@@ -64,13 +52,51 @@ fn bad_keyframes_and_sightings_are_counted_and_the_map_is_the_same() {
         }
     })
     .unwrap();
-    let count = recordings().iter().map(Recording::len).sum::<usize>() as u64;
-    let refused = rejected(&meddled, 0);
-    assert_eq!(refused, 4 * count);
+    expect_refused(&meddled, 3);
     assert_eq!(rejected(&honest, 0), 0);
-    let reports = meddled.events.iter().filter(|(_, event)| matches!(event, Event::Rejected { .. })).count() as u64;
-    assert!(reports > 0 && reports < count, "{reports} reports of {refused} refusals");
     assert_eq!(t_alpha_beta(&meddled), t_alpha_beta(&honest));
+}
+
+/// A keyframe that is refused is one that the chain lacks, whatever else it says: the map may not be as sure as before.
+#[test]
+fn bad_keyframes_are_counted_and_the_map_is_less_certain_but_right() {
+    let honest = play(&recordings(), 1).unwrap();
+    let good = recordings()[0].keyframe(0).unwrap();
+    let at = |x: f64| PoseWithCovariance { pose: Se3::new(So3::identity(), Vector3::new(x, 0.0, 0.0)), ..good.pose };
+    let meddled = play_with(&recordings(), 1, |wires, count| {
+        // Older than anything, and NaN in points or pose beside it.
+        let mut bad = good.clone();
+        bad.stamp = Stamp(i64::MIN);
+        match count % 3 {
+            0 => {}
+            1 => bad.points.push([f32::NAN; 3]),
+            _ => bad.pose = at(f64::NAN),
+        }
+        wires.input(0, Input::Keyframe(bad));
+    })
+    .unwrap();
+    expect_refused(&meddled, 1);
+    let [stats, undisturbed] = [&meddled, &honest].map(|wires| snapshot(wires, 0).status);
+    assert_eq!(stats.keyframes_lost.values().sum::<u64>(), keyframes());
+    assert!(stats.gaps > 0 && undisturbed.gaps == 0, "{} gaps", stats.gaps);
+    let [with, without] = [&meddled, &honest].map(t_alpha_beta);
+    for (k, (with, without)) in with.sigmas.iter().zip(without.sigmas).enumerate() {
+        assert!(*with > without, "axis {k}: {with} is no less certain than {without}");
+    }
+    let apart = Vector3::from(with.pose.translation) - Vector3::from(without.pose.translation);
+    assert!((0..3).all(|k| apart[k].abs() < 3.0 * with.sigmas[k]), "{apart:?} apart, sigmas {:?}", with.sigmas);
+}
+
+fn keyframes() -> u64 {
+    recordings().iter().map(Recording::len).sum::<usize>() as u64
+}
+
+/// That alpha refused so much for each keyframe of anybody, and told of it now and then.
+fn expect_refused(meddled: &Wires, each: u64) {
+    let refused = rejected(meddled, 0);
+    assert_eq!(refused, each * keyframes());
+    let reports = meddled.events.iter().filter(|(_, event)| matches!(event, Event::Rejected { .. })).count() as u64;
+    assert!(reports > 0 && reports < keyframes(), "{reports} reports of {refused} refusals");
 }
 
 /// Every message that the swarm sends, truncated, lengthened, with single bits flipped, and of another version.
