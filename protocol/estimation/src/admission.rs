@@ -171,14 +171,16 @@ impl Admission {
 
     /// Sets an edge aside; whether it counted until now.
     pub(super) fn drop_edge(&mut self, label: Label, reason: Unused) -> bool {
-        let wanted = match label {
-            Label::Odometry | Label::Cloud => return false,
-            Label::Alignment(entry) => (Kind::Alignment, entry),
-            Label::Sighting(entry) => (Kind::Sighting, entry),
-            Label::Position(entry) => (Kind::Position, entry),
-        };
+        let Some(wanted) = named(label) else { return false };
         let is_it = |e: &&mut EdgeEstimate| e.unused.is_none() && (e.kind, e.measurement.entry) == wanted;
         self.edges.iter_mut().find(is_it).map(|e| e.refuse(reason)).is_some()
+    }
+
+    /// A measurement that counts, with its covariance as it counts.
+    pub(super) fn stated(&self, label: Label) -> Option<Relative> {
+        let wanted = named(label)?;
+        let edge = self.edges.iter().find(|e| e.is_used() && (e.kind, e.measurement.entry) == wanted)?;
+        Some(edge.measurement.t_i_j.widened((1.0 / edge.weight).sqrt()))
     }
 
     /// Of a component that cannot be solved, sets aside every edge of the frame that conditions it worst, or, where
@@ -258,6 +260,16 @@ impl Admission {
                 edge.refuse(Unused::Contradicts(d.distance_squared));
             }
         }
+    }
+}
+
+/// Which edge a factor stands for, if any.
+fn named(label: Label) -> Option<(Kind, EntryId)> {
+    match label {
+        Label::Odometry | Label::Cloud => None,
+        Label::Alignment(entry) => Some((Kind::Alignment, entry)),
+        Label::Sighting(entry) => Some((Kind::Sighting, entry)),
+        Label::Position(entry) => Some((Kind::Position, entry)),
     }
 }
 

@@ -261,7 +261,9 @@ impl Map {
                 match solution {
                     Ok(solution) => {
                         start.extend(solution.graph().nodes().iter().copied().zip(solution.values().iter().copied()));
-                        for Drop { label, chi2 } in reweight::contradictions(&solution, round) {
+                        for Drop { label, chi2 } in
+                            reweight::contradictions(&solution, round, |label| admission.stated(label))
+                        {
                             changed |= admission.drop_edge(label, Unused::Contradicts(chi2));
                         }
                         solutions.push((frames, Ok(solution)));
