@@ -150,19 +150,21 @@ pub(super) fn canonical<K: Key>(a: &Factor<K>, b: &Factor<K>) -> core::cmp::Orde
 
 /// Total order of measurements by their numbers.
 pub(super) fn content_order(a: &Relative, b: &Relative) -> core::cmp::Ordering {
-    let numbers = |t: &Relative| {
-        let s = t.sim();
-        let mut out: Vec<f64> = s.translation.iter().copied().chain(s.rotation.xyzw()).collect();
-        out.push(s.scale);
-        match t {
-            Relative::Metric(p) => out.extend(p.covariance.matrix().iter()),
-            Relative::Similarity(q) => out.extend(q.covariance.matrix().iter()),
-        }
-        out
-    };
-    let (a, b) = (numbers(a), numbers(b));
+    let (a, b) = (numbers_of(a), numbers_of(b));
     let by_number = a.iter().zip(&b).map(|(x, y)| x.total_cmp(y)).find(|o| o.is_ne());
     by_number.unwrap_or_else(|| a.len().cmp(&b.len()))
+}
+
+/// All that a measurement says.
+pub(super) fn numbers_of(t: &Relative) -> Vec<f64> {
+    let s = t.sim();
+    let mut out: Vec<f64> = s.translation.iter().copied().chain(s.rotation.xyzw()).collect();
+    out.push(s.scale);
+    match t {
+        Relative::Metric(p) => out.extend(p.covariance.matrix().iter()),
+        Relative::Similarity(q) => out.extend(q.covariance.matrix().iter()),
+    }
+    out
 }
 
 /// Whether a relation between nodes of two units is rigid.

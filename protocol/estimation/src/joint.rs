@@ -19,6 +19,7 @@ use super::pairs::{self, Pair, PairEstimate};
 use super::position::{SeenPoint, StatedPoint};
 use super::reweight::{self, Drop};
 use super::solve::{ComponentError, Solution, SolveError, solve_within};
+use super::verdicts::Verdicts;
 use crate::config::EstimateConfig;
 use crate::geometry::{PoseWithCovariance, Relative, Se3, Sim3};
 use crate::ids::{EntryId, FrameId, SubmapId};
@@ -221,8 +222,14 @@ pub struct JointEstimate {
 
 /// Solves the map. Never fails: what cannot be used is listed in [`JointEstimate::edges`] with its reason.
 pub fn solve_map(problem: &MapProblem, config: &EstimateConfig) -> JointEstimate {
+    solve_map_recalling(problem, config, &mut Verdicts::default())
+}
+
+/// [`solve_map`], to the bit, for those who solve a map again that has changed a little: what pairs of frames came to is
+/// taken from `verdicts` where it cannot have changed, and left there for the next time.
+pub fn solve_map_recalling(problem: &MapProblem, config: &EstimateConfig, verdicts: &mut Verdicts) -> JointEstimate {
     let mut admission = Admission::new(problem);
-    let mut pairs = pairs::consensus(&mut admission, config);
+    let mut pairs = pairs::consensus(&mut admission, config, verdicts);
     let start = pairs::start(&admission, &pairs).into_iter().map(|(id, t)| (Node::Anchor(id), t)).collect();
     let mut map = Map::solve(&mut admission, &mut pairs, start, config);
     let unknown_scale = admission.unknown_scale.clone();

@@ -52,6 +52,7 @@ pub mod solve;
 mod solve_error;
 mod sparse;
 pub mod trajectory;
+pub mod verdicts;
 
 use merganser_geometry as geometry;
 use merganser_types::{config, ids, kinds};

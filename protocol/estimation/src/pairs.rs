@@ -10,6 +10,7 @@ use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_fra
 use super::graph::is_rigid;
 use super::joint::{AgreedAlignment, EdgeEstimate, JointEstimate, Unused};
 use super::loops::{self, Loops};
+use super::verdicts::{Verdict, Verdicts};
 use crate::config::EstimateConfig;
 use crate::geometry::{Disagreement, Relative, Sim3, chi2};
 use crate::ids::{FrameId, SubmapId};
@@ -82,6 +83,7 @@ pub(super) struct Pair {
 }
 
 /// What the frame-level consensus says.
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Outcome {
     pub(super) status: PairStatus,
     /// Indices among the alignments given.
@@ -94,7 +96,7 @@ pub(super) struct Outcome {
 }
 
 /// Runs the consensus on every pair, and marks the admission's edges accordingly.
-pub(super) fn consensus(admission: &mut Admission, config: &EstimateConfig) -> Vec<Pair> {
+pub(super) fn consensus(admission: &mut Admission, config: &EstimateConfig, known: &mut Verdicts) -> Vec<Pair> {
     let loops = loops::gate(admission);
     let repeat = repeating(&loops, &admission.ambiguous);
     let mut members: BTreeMap<(FrameId, FrameId), Vec<usize>> = BTreeMap::new();
@@ -110,9 +112,13 @@ pub(super) fn consensus(admission: &mut Admission, config: &EstimateConfig) -> V
             list.entry((i.min(j), i.max(j))).or_default().push(k);
         }
     }
-    let mut pair = |((a, b), members): ((FrameId, FrameId), Vec<usize>)| {
-        let weighed = weighed(admission, (a, b), &members, config);
-        let outcome = decide(admission, (a, b), &weighed, config);
+    let verdicts = known.on(&members, admission, config, |pair, members| {
+        let weighed = weighed(admission, pair, members, config);
+        let edges: Vec<usize> = weighed.iter().map(|&k| members[k]).collect();
+        Verdict { outcome: decide(admission, pair, &edges, config), weighed }
+    });
+    let mut pair = |(((a, b), members), Verdict { weighed, outcome }): (((FrameId, FrameId), Vec<usize>), Verdict)| {
+        let weighed = weighed.into_iter().map(|k| members[k]).collect();
         let ambiguous = admission.ambiguous.get(&(a, b)).copied().unwrap_or(0);
         let outcome = if repeat.contains(&a) || repeat.contains(&b) {
             outcome.unless_merged()
@@ -122,7 +128,7 @@ pub(super) fn consensus(admission: &mut Admission, config: &EstimateConfig) -> V
         let second_looks = second.remove(&(a, b)).unwrap_or_default();
         Pair { a, b, members, weighed, second_looks, outcome, contradicts_loop: false, in_tree: false }
     };
-    let mut pairs: Vec<Pair> = members.into_iter().map(&mut pair).collect();
+    let mut pairs: Vec<Pair> = members.into_iter().zip(verdicts).map(&mut pair).collect();
     for pair in &pairs {
         pair.mark(admission);
     }
@@ -250,7 +256,7 @@ fn used(of: &[usize], edges: &[EdgeEstimate]) -> usize {
     of.iter().filter(|&&k| edges[k].is_used()).count()
 }
 
-/// At most [`WEIGHED_MAX`] of a pair's alignments: the most promising where units are equal, else evenly from first to
+/// Positions of at most [`WEIGHED_MAX`] of a pair's alignments: the most promising where units are equal, else evenly from first to
 /// last in canonical order.
 fn weighed(
     admission: &Admission,
@@ -259,17 +265,16 @@ fn weighed(
     config: &EstimateConfig,
 ) -> Vec<usize> {
     if members.len() <= WEIGHED_MAX {
-        return members.to_vec();
+        return (0..members.len()).collect();
     }
     let oriented = members.iter().map(|&k| orient(&admission.edges[k], a));
     let metric = oriented.map(|(i, j, t)| t.metric().map(|&t_i_j| PairAlignment { i, j, t_i_j }));
     match metric.collect::<Option<Vec<_>>>() {
         Some(alignments) if is_rigid(a, b, &admission.unknown_scale) => {
             let (alpha, beta) = (&admission.chains[&a].trajectory, &admission.chains[&b].trajectory);
-            let chosen = promising(alpha, beta, &alignments, &FrameConsensusConfig::from(config), WEIGHED_MAX);
-            chosen.into_iter().map(|k| members[k]).collect()
+            promising(alpha, beta, &alignments, &FrameConsensusConfig::from(config), WEIGHED_MAX)
         }
-        _ => (0..WEIGHED_MAX).map(|k| members[k * members.len() / WEIGHED_MAX]).collect(),
+        _ => (0..WEIGHED_MAX).map(|k| k * members.len() / WEIGHED_MAX).collect(),
     }
 }
 

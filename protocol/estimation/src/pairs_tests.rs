@@ -5,6 +5,7 @@ use super::joint::*;
 use super::pairs;
 use super::test_graphs::*;
 use super::test_world::*;
+use super::verdicts::Verdicts;
 use crate::config::EstimateConfig;
 use crate::geometry::{PoseWithCovariance, Relative, Se3};
 use crate::ids::EntryId;
@@ -144,7 +145,7 @@ fn what_merges_nothing_does_not_hold_together_what_falls_apart() {
     let second_looks = between[2..].iter().copied().collect();
     let problem = MapProblem { second_looks, ..world.problem.clone() };
     let mut admission = Admission::new(&problem);
-    let mut pairs = pairs::consensus(&mut admission, &EstimateConfig::default());
+    let mut pairs = pairs::consensus(&mut admission, &EstimateConfig::default(), &mut Verdicts::default());
     admission.edges.iter_mut().for_each(|edge| edge.unused = None);
     admission.edges.iter_mut().find(|e| of_ends(&e.measurement) == (a, c)).unwrap().refuse(Unused::Contradicts(1e3));
     pairs::demote(&mut admission, &mut pairs, 3);

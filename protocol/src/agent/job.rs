@@ -6,10 +6,11 @@ use crate::align::{Model, Problem, SolverConfig};
 use crate::config::{AlignConfig, EstimateConfig, Sensor, SubmapConfig};
 use crate::estimate::PairEstimate;
 use crate::estimate::extrapolation::End;
-use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Shortfall, Unused, solve_map};
+use crate::estimate::joint::{AgreedAlignment, EdgeEstimate, MapProblem, Shortfall, Unused, solve_map_recalling};
 use crate::estimate::node::Node;
 use crate::estimate::optimality::Optimality;
 use crate::estimate::solve::ComponentError;
+use crate::estimate::verdicts::Verdicts;
 use crate::geometry::Relative;
 use crate::ids::{FrameId, SubmapId};
 use crate::submap::landmarks::{self, LandmarkConfig, LandmarkError};
@@ -80,6 +81,8 @@ pub struct SolveJob {
     pub own: FrameId,
     /// Pairs of anchors whose relation is asked for.
     pub live: Vec<(SubmapId, SubmapId)>,
+    /// What is known of pairs of frames from the solve before. The result does not depend on it.
+    pub verdicts: Verdicts,
 }
 
 /// What a [`Job`] gave.
@@ -120,6 +123,8 @@ pub struct Solved {
     pub converged: bool,
     /// The components that were not, and why.
     pub failed: Vec<(Vec<FrameId>, Shortfall)>,
+    /// For the next solve.
+    pub verdicts: Verdicts,
 }
 
 impl Solved {
@@ -227,8 +232,8 @@ impl Job {
 }
 
 impl SolveJob {
-    fn run(&self) -> Solved {
-        let estimate = solve_map(&self.problem, &self.config);
+    fn run(mut self) -> Solved {
+        let estimate = solve_map_recalling(&self.problem, &self.config, &mut self.verdicts);
         let components = estimate.components().filter_map(|frames| Some((*frames.iter().min()?, frames)));
         let placed = |frame| estimate.frame(self.own, frame);
         let related = estimate.relatives(&self.live);
@@ -247,6 +252,7 @@ impl SolveJob {
             optimality: estimate.optimality(),
             converged: estimate.converged,
             failed: estimate.shortfalls().map(|(frames, why)| (frames.to_vec(), why)).collect(),
+            verdicts: self.verdicts,
         }
     }
 }

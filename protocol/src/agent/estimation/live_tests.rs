@@ -3,6 +3,7 @@ use crate::agent::job::{Job, JobResult, SolveJob, Solved};
 use crate::config::EstimateConfig;
 use crate::estimate::test_graphs::{frame, measured, normal, rng, sigmas, submap};
 use crate::estimate::test_world::World;
+use crate::estimate::verdicts::Verdicts;
 use crate::geometry::{Covariance, Se3};
 
 fn robots(count: u8) -> Vec<Vec<SubmapId>> {
@@ -48,6 +49,7 @@ fn anees_of_live_pairs_lies_in_the_band() {
             config: EstimateConfig::default(),
             own: frame(0),
             live: vec![(a, b), (submap(0, 15), a), (a, submap(9, 0))],
+            verdicts: Verdicts::default(),
         };
         let JobResult::Solved(solved) = Job::Solve(Box::new(job)).run() else { panic!("another job's result") };
         assert!(solved.converged && solved.failed.is_empty());

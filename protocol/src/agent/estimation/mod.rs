@@ -13,6 +13,7 @@ use super::io::{Event, JobId};
 use super::job::{Job, SolveJob, Solved};
 use super::replication::Replication;
 use super::replication::knowledge::{EstimationInput, Gaps, Known};
+use crate::estimate::verdicts::Verdicts;
 use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{FrameId, Hash, SubmapId};
 use crate::time::Instant;
@@ -48,6 +49,8 @@ pub(super) struct Estimation {
     merged: BTreeSet<FrameId>,
     /// The odometry of the last problem posed.
     steps: Steps,
+    /// What pairs of frames came to; with the job while one runs.
+    verdicts: Verdicts,
 }
 
 impl Estimation {
@@ -82,7 +85,8 @@ impl Estimation {
         self.steps = steps;
         let live = live::live_pairs(context.robot(), robots, &problem, &gaps);
         let interval = Duration::from_secs_f64(config.interval_secs);
-        let job = SolveJob { problem, config, own, live };
+        let verdicts = core::mem::take(&mut self.verdicts);
+        let job = SolveJob { problem, config, own, live, verdicts };
         (self.posed_from, self.posed_alone, self.posed_gaps) = (Some(own), alone, gaps);
         self.dirty = false;
         self.posed_at = context.now();
@@ -92,10 +96,11 @@ impl Estimation {
     }
 
     /// The estimate was solved. False if it is not the one that was asked for.
-    pub(super) fn on_solved(&mut self, context: &mut Context, job: JobId, solved: Solved) -> bool {
+    pub(super) fn on_solved(&mut self, context: &mut Context, job: JobId, mut solved: Solved) -> bool {
         if self.solving.take_if(|running| *running == job).is_none() {
             return false;
         }
+        self.verdicts = core::mem::take(&mut solved.verdicts);
         let rest = context.now().since(self.posed_at).saturating_mul(REST).min(REST_MAX);
         self.next_solve = self.next_solve.max(context.now().after(rest));
         self.digest = self.posed_digest;

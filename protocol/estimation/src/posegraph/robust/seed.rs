@@ -9,6 +9,7 @@ use crate::geometry::{PoseWithCovariance, Relative, Sim3};
 use crate::ids::{EntryId, SubmapId};
 use crate::kinds::ScaleKind;
 use crate::marginals::certain;
+use crate::verdicts::Verdicts;
 use crate::{AgreedAlignment, FrameChain, MapProblem, pairs};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -40,7 +41,7 @@ impl Seed {
         let tied = closures.iter().filter(|c| [c.i, c.j].iter().all(|id| frames.contains_key(&id.frame)));
         let alignments = tied.map(agreed).collect();
         let mut admission = Admission::new(&MapProblem { frames, alignments, ..MapProblem::default() });
-        let pairs = pairs::consensus(&mut admission, config);
+        let pairs = pairs::consensus(&mut admission, config, &mut Verdicts::default());
         let start = pairs::start(&admission, &pairs);
         let used = admission.edges.iter().filter(|e| e.is_used()).map(|e| e.measurement.entry.seq as usize).collect();
         Self { used, start }
