@@ -1,14 +1,15 @@
 //! The command line. Exit codes: 0, all went well; 1, it did not (a check failed, the agent could not go on); 2, the
-//! command line or the configuration is wrong.
+//! command line, the configuration or a file that was given is wrong.
 
-use crate::commands::{check, graph, keys, replay, run, store, watch};
+use crate::commands::{BadInput, check, graph, keys, replay, run, store, watch};
 use crate::config::FileConfigError;
 use crate::demo::{self, DemoArgs};
 use crate::host::HostError;
 use anyhow::Result;
 use clap::{Parser, Subcommand};
+use merganser_recording::{Problem, RecordingError};
 use std::ffi::OsString;
-use std::io;
+use std::io::{self, ErrorKind};
 use std::process::ExitCode;
 
 /// Robot swarms that merge their maps with no server.
@@ -17,8 +18,10 @@ use std::process::ExitCode;
 /// overlaps, and every robot ends with the same merged map.
 #[derive(Debug, Parser)]
 #[command(name = "merganser", version, propagate_version = true, max_term_width = 100)]
-#[command(after_help = "Exit codes: 0 all went well, 1 it did not, 2 the command line or configuration is wrong.\n\
-                        Start with `merganser demo`.")]
+#[command(
+    after_help = "Exit codes: 0 all went well, 1 it did not, 2 the command line, the configuration or a file given is wrong.\n\
+                        Start with `merganser demo`."
+)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]
@@ -64,7 +67,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Err(error) if is_closed_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             let _ = console::Term::stderr().write_line(&format!("merganser: {}", explain(&error)));
-            ExitCode::from(if is_misconfigured(&error) { 2 } else { 1 })
+            ExitCode::from(if is_bad_input(&error) { 2 } else { 1 })
         }
     }
 }
@@ -91,12 +94,27 @@ fn explain(error: &anyhow::Error) -> String {
     })
 }
 
-fn is_misconfigured(error: &anyhow::Error) -> bool {
+/// Whether what the user gave is to blame; a disk that is full is not.
+fn is_bad_input(error: &anyhow::Error) -> bool {
     let host = error.downcast_ref::<HostError>();
-    error.downcast_ref::<FileConfigError>().is_some() || matches!(host, Some(HostError::Config(_)))
+    let is_bad = |cause: &(dyn std::error::Error + 'static)| {
+        cause.is::<BadInput>() || cause.downcast_ref::<RecordingError>().is_some_and(is_bad_recording)
+    };
+    error.downcast_ref::<FileConfigError>().is_some()
+        || matches!(host, Some(HostError::Config(_)))
+        || error.chain().any(is_bad)
+}
+
+fn is_bad_recording(error: &RecordingError) -> bool {
+    match &error.problem {
+        Problem::Io(error) => {
+            matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory | ErrorKind::IsADirectory)
+        }
+        _ => true,
+    }
 }
 
 /// Whoever read our output has enough of it: `merganser watch --json | head`.
 fn is_closed_pipe(error: &anyhow::Error) -> bool {
-    error.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == io::ErrorKind::BrokenPipe)
+    error.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == ErrorKind::BrokenPipe)
 }

@@ -29,7 +29,7 @@ fn bad_data_is_told_in_one_line() {
     let absent = dir.path().join("absent");
     for (data, what) in [(&nothing, "nothing here can be fed to robots"), (&absent, "No such file")] {
         let told = demo(&dir.path().join("out")).arg("--data").arg(data).output().unwrap();
-        assert_eq!(told.status.code(), Some(1));
+        assert_eq!(told.status.code(), Some(2));
         let text = String::from_utf8(told.stderr).unwrap();
         assert!(text.contains(what) && text.contains(data.to_str().unwrap()), "{text}");
         assert_eq!(text.lines().count(), 1, "{text}");

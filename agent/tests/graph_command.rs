@@ -132,7 +132,7 @@ fn faults_are_told_by_file_and_line() {
     let write = |name: &str, text: &str| std::fs::write(at.join(name), text).unwrap();
     let refused = |arguments: &str, parts: &[&str]| {
         let (code, said, told) = graph(at, arguments);
-        assert_eq!((code, said.as_str()), (1, ""), "{arguments}");
+        assert_eq!((code, said.as_str()), (2, ""), "{arguments}");
         assert_eq!(told.lines().count(), 1, "{told}");
         assert!(parts.iter().all(|part| told.contains(part)), "{arguments}: {told}");
     };
@@ -210,7 +210,7 @@ fn tables_are_fused_and_what_contradicts_is_refused() {
     assert!((independent[2][9] / a[2][9] - 0.5).abs() < 1e-3, "{independent:?}");
     let refused = |arguments: &str, parts: &[&str]| {
         let (code, _, told) = graph(at, arguments);
-        assert_eq!(code, 1, "{arguments}");
+        assert_eq!(code, 2, "{arguments}");
         assert!(parts.iter().all(|part| told.contains(part)) && !at.join("no.csv").exists(), "{arguments}: {told}");
     };
     refused("fuse a.csv far.csv --out no.csv", &["a.csv:3 and far.csv:3: pose 1: the two estimates disagree (χ² "]);
@@ -254,7 +254,7 @@ fn robots_that_number_alike_are_told_apart_by_the_cure() {
             std::fs::write(at.join("B.g2o"), chain(first, 2, 2.0, with_poses)).unwrap();
             for how in ["", " --robust"] {
                 let (code, _, told) = graph(at, &format!("solve A.g2o B.g2o --tum t.tum{how}"));
-                assert!(code == 1 && !at.join("t.tum").exists(), "{told}");
+                assert!(code == 2 && !at.join("t.tum").exists(), "{told}");
                 let place = if with_poses { "B.g2o:2: states" } else { "B.g2o:1: measures" };
                 let names = if letter == 0 { "the ids 0 to 2" } else { "(x0) to " };
                 for part in [place, "otherwise than A.g2o:", names, "letter", "graph split B.g2o --robots 1 --first"] {
@@ -280,7 +280,7 @@ fn robots_that_number_alike_are_told_apart_by_the_cure() {
             assert_eq!(read(at, own).matches('#').count(), 1, "one part of the two");
         }
     }
-    assert_eq!(graph(at, "split A.g2o --robots 2 --first z --out no.g2o").0, 1);
+    assert_eq!(graph(at, "split A.g2o --robots 2 --first z --out no.g2o").0, 2);
     assert_eq!(graph(at, "split A.g2o --robots 2 --first 1 --out no.g2o").0, 2);
 }
 
@@ -294,4 +294,24 @@ fn robots_that_number_in_different_strides_are_doubted() {
     let (code, _, told) = graph(at, "solve A.g2o B.g2o");
     assert_eq!((code, told.lines().count()), (0, 1), "{told}");
     assert!(told.contains("A.g2o, B.g2o: several of these files use 3 ids from 0 to 12, without"), "{told}");
+}
+
+#[test]
+fn what_does_not_converge_is_told_with_what_may_help() {
+    let dir = tempfile::tempdir().unwrap();
+    let turned = |i: u64, j: u64| {
+        edge(i, j, 1.0, "100").replace(" 0 0 0 1 100", " 0 0 0.7071067811865476 0.7071067811865476 100")
+    };
+    let bent = [(0, 1), (1, 2), (2, 3)].map(|(i, j)| turned(i, j)).concat() + &edge(3, 0, 5.0, "100");
+    std::fs::write(dir.path().join("bent.g2o"), bent).unwrap();
+    for (how, parts) in [
+        ("", ["(--iterations)", "--start chordal", "(--robust)"]),
+        (" --start chordal", ["(--iterations)", "(--certify)", "(--robust)"]),
+    ] {
+        let (code, said, told) = graph(dir.path(), &format!("solve bent.g2o --iterations 1{how}"));
+        assert!(code == 1 && said.contains("NOT CONVERGED"), "{code}: {said}");
+        assert!(told.contains("part 1 is not at a minimum after 1 iteration:"), "{told}");
+        assert!(parts.iter().all(|part| told.contains(part)) && told.lines().count() == 1, "{told}");
+    }
+    assert_eq!(graph(dir.path(), "solve bent.g2o").0, 0);
 }

@@ -152,7 +152,7 @@ fn a_bad_cloud_ends_the_agent_with_an_error() {
     write_configs(folder, &["alpha"]);
     let ended = spawn(&["run", "-c", "alpha.toml", "--recording", "walk", "--speed", "100"], folder);
     let ended = ended.wait_with_output().unwrap();
-    assert_eq!(ended.status.code(), Some(1));
+    assert_eq!(ended.status.code(), Some(2));
     assert!(text(&ended.stderr).contains("2.bin"), "{}", text(&ended.stderr));
 }
 
@@ -205,6 +205,6 @@ fn a_busy_port_and_a_bad_recording_get_one_error_each() {
     let none: PathBuf = dir.path().join("none");
     let refused = spawn(&["run", "-c", "alpha.toml", "--recording", none.to_str().unwrap()], dir.path());
     let refused = refused.wait_with_output().unwrap();
-    assert_eq!(refused.status.code(), Some(1));
+    assert_eq!(refused.status.code(), Some(2));
     assert!(text(&refused.stderr).contains("none"), "{}", text(&refused.stderr));
 }

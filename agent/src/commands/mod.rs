@@ -11,6 +11,17 @@ pub mod watch;
 use anyhow::{Context, Result};
 use std::io::Write;
 
+/// A file or an argument that cannot be used, with the cure: exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct BadInput(String);
+
+impl BadInput {
+    pub(crate) fn told(text: impl Into<String>) -> anyhow::Error {
+        Self(text.into()).into()
+    }
+}
+
 /// Prints a line.
 pub(crate) fn say(line: &str) -> std::io::Result<()> {
     let mut out = std::io::stdout().lock();

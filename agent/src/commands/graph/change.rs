@@ -2,8 +2,8 @@
 
 use super::read::{self, Source};
 use super::write::write;
-use super::{SplitArgs, counted, say};
-use anyhow::{Context, Result, bail};
+use super::{BadInput, SplitArgs, counted, say};
+use anyhow::{Context, Result};
 use merganser_protocol::estimate::posegraph::g2o::number_of;
 use merganser_protocol::estimate::posegraph::robust::robot_of;
 use merganser_protocol::estimate::posegraph::{Measurement, PoseGraph, g2o};
@@ -15,16 +15,13 @@ pub fn split(args: &SplitArgs) -> Result<bool> {
     let graph = Source::read(std::slice::from_ref(&args.file))?.graph;
     let (poses, robots) = (graph.poses.len(), usize::from(args.robots));
     if poses < robots {
-        bail!(
-            "{}: {} cannot be shared among {}",
-            args.file.display(),
-            counted(poses, "pose"),
-            counted(robots, "robot")
-        );
+        let (file, poses, robots) = (args.file.display(), counted(poses, "pose"), counted(robots, "robot"));
+        return Err(BadInput::told(format!("{file}: {poses} cannot be shared among {robots}")));
     }
     let letter = u64::from(u32::from(args.first));
     if letter + robots as u64 > u64::from(b'z') + 1 {
-        bail!("--first {}: from there on the alphabet has no {}", args.first, counted(robots, "letter"));
+        let letters = counted(robots, "letter");
+        return Err(BadInput::told(format!("--first {}: from there on the alphabet has no {letters}", args.first)));
     }
     let of_one = |id: &u64| graph.poses.keys().next().is_some_and(|first| robot_of(*first) == robot_of(*id));
     let keep = robots == 1 && graph.poses.keys().all(of_one);
@@ -64,11 +61,11 @@ pub fn import_kimera(folder: &Path, out: &Path) -> Result<bool> {
     }
     tables.sort();
     if tables.is_empty() {
-        bail!("{}: no folder in it has a measurements.csv", folder.display());
+        return Err(BadInput::told(format!("{}: no folder in it has a measurements.csv", folder.display())));
     }
     let graph = read::kimera(&tables)?;
     if graph.poses.is_empty() {
-        bail!("{}: no measurement in its tables", folder.display());
+        return Err(BadInput::told(format!("{}: no measurement in its tables", folder.display())));
     }
     write(out, &g2o::write(&graph))?;
     say(&format!(

@@ -1,8 +1,8 @@
 //! `merganser graph fuse`: two estimates of the same poses, of which nobody knows what they have in common.
 
 use super::write::write;
-use super::{FuseArgs, counted, read, say};
-use anyhow::{Result, anyhow, bail};
+use super::{BadInput, FuseArgs, counted, read, say};
+use anyhow::Result;
 use merganser_protocol::estimate::posegraph::marginals;
 
 /// Fuses two tables.
@@ -12,10 +12,11 @@ pub fn fuse(args: &FuseArgs) -> Result<bool> {
     let (first, second) = (args.first.display(), args.second.display());
     let out = marginals::fuse(&a, &b, args.independent).map_err(|error| {
         let [line, other] = error.lines;
-        anyhow!("{first}:{line} and {second}:{other}: {error}")
+        BadInput::told(format!("{first}:{line} and {second}:{other}: {error}"))
     })?;
     if out.both == 0 {
-        bail!("{first} and {second}: no pose is in both; fused are poses of the same id");
+        let told = format!("{first} and {second}: no pose is in both; fused are poses of the same id");
+        return Err(BadInput::told(told));
     }
     write(&args.out, &marginals::write(&out.rows))?;
     let [only_first, only_second] = out.only;

@@ -8,7 +8,7 @@ mod robust;
 mod solve;
 mod write;
 
-use super::say;
+use super::{BadInput, say};
 use anyhow::Result;
 use clap::{Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};

@@ -1,7 +1,7 @@
 //! Graphs and tables from files, and errors told by file and line.
 
-use super::{counted, identity, warn};
-use anyhow::{Context, Error, Result, anyhow, bail};
+use super::{BadInput, counted, identity, warn};
+use anyhow::{Error, Result};
 use merganser_protocol::estimate::posegraph::PoseGraph;
 use merganser_protocol::estimate::posegraph::fault::{PoseGraphError, PoseName};
 use merganser_protocol::estimate::posegraph::g2o::{Fault, G2oError, LINE_MAX, Parser, Stated};
@@ -29,7 +29,7 @@ impl Source {
             parser.begin();
             let mut otherwise = None;
             for line in lines(path)? {
-                match parser.line(&line.with_context(|| path.display().to_string())?) {
+                match parser.line(&line?) {
                     // The rest of the file tells which poses both have.
                     Err(G2oError { line, what: Fault::Otherwise(ends, first) }) => {
                         otherwise.get_or_insert((line, Stated(ends), first));
@@ -47,7 +47,8 @@ impl Source {
         let (lines, repeated) = (parser.files().clone(), parser.repeated());
         let graph = parser.finish();
         if graph.poses.is_empty() {
-            bail!("{}: no pose in it", files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(", "));
+            let names = files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(", ");
+            return Err(BadInput::told(format!("{names}: no pose in it")));
         }
         let source = Self { graph, names: files.to_vec(), lines };
         if let Some(repeated) = repeated {
@@ -64,9 +65,9 @@ impl Source {
     /// An error of a part of the graph: by file and line, or else by the part's smallest pose.
     pub fn explained(&self, error: PoseGraphError, part: &PoseGraph) -> Error {
         match (error, part.poses.keys().next()) {
-            (PoseGraphError::At { line, what }, _) => anyhow!("{}: {what}", self.place(line)),
-            (error, Some(&first)) => Error::new(error).context(format!("the part of {}", PoseName(first))),
-            (error, None) => Error::new(error),
+            (PoseGraphError::At { line, what }, _) => BadInput::told(format!("{}: {what}", self.place(line))),
+            (error, Some(&first)) => BadInput::told(format!("the part of {}: {error}", PoseName(first))),
+            (error, None) => BadInput::told(error.to_string()),
         }
     }
 
@@ -84,7 +85,7 @@ pub fn kimera(tables: &[PathBuf]) -> Result<PoseGraph> {
     for path in tables {
         importer.begin();
         for line in lines(path)? {
-            importer.line(&line.with_context(|| path.display().to_string())?).map_err(|e| at(path, e.line, e.what))?;
+            importer.line(&line?).map_err(|e| at(path, e.line, e.what))?;
         }
     }
     Ok(importer.finish().0)
@@ -94,22 +95,23 @@ pub fn kimera(tables: &[PathBuf]) -> Result<PoseGraph> {
 pub fn marginals(path: &Path) -> Result<BTreeMap<u64, Marginal>> {
     let mut reader = Reader::default();
     for line in lines(path)? {
-        reader.line(&line.with_context(|| path.display().to_string())?).map_err(|e| at(path, e.line, e.what))?;
+        reader.line(&line?).map_err(|e| at(path, e.line, e.what))?;
     }
     let rows = reader.finish();
     if rows.is_empty() {
-        bail!("{}: no pose in it", path.display());
+        return Err(BadInput::told(format!("{}: no pose in it", path.display())));
     }
     Ok(rows)
 }
 
 fn at(path: &Path, line: usize, what: impl Display) -> Error {
-    anyhow!("{}:{line}: {what}", path.display())
+    BadInput::told(format!("{}:{line}: {what}", path.display()))
 }
 
 /// The lines of a text file; a line without end is cut, so that the parser refuses it.
-fn lines(path: &Path) -> Result<impl Iterator<Item = std::io::Result<String>>> {
-    let file = File::open(path).with_context(|| path.display().to_string())?;
+fn lines(path: &Path) -> Result<impl Iterator<Item = Result<String>>> {
+    let unread = |error: std::io::Error| BadInput::told(format!("{}: {error}", path.display()));
+    let file = File::open(path).map_err(unread)?;
     let mut reader = BufReader::new(file);
     Ok(std::iter::from_fn(move || {
         let mut line = Vec::new();
@@ -124,7 +126,7 @@ fn lines(path: &Path) -> Result<impl Iterator<Item = std::io::Result<String>>> {
                     line.extend_from_slice(&text[..text.len().min(room)]);
                     (text.len() + usize::from(end.is_some()), end.is_some())
                 }
-                Err(error) => return Some(Err(error)),
+                Err(error) => return Some(Err(unread(error))),
             };
             reader.consume(used);
             if done {

@@ -3,8 +3,8 @@
 use super::read::Source;
 use super::solve::unsigned;
 use super::write::{Part, write, write_parts};
-use super::{SolveArgs, counted, say, waiting, warn};
-use anyhow::{Result, bail};
+use super::{BadInput, SolveArgs, counted, say, waiting, warn};
+use anyhow::Result;
 use merganser_protocol::config::EstimateConfig;
 use merganser_protocol::estimate::posegraph::PoseGraph;
 use merganser_protocol::estimate::posegraph::fault::{PoseName, Unsolved};
@@ -28,7 +28,7 @@ pub fn solve(args: &SolveArgs) -> Result<bool> {
     let seconds = began.elapsed().as_secs_f64();
     let unsolved = graph.unsolved(&solved);
     if let (true, Some(first)) = (solved.components.is_empty(), unsolved.first()) {
-        bail!("nothing could be solved: {}", why(&source, first));
+        return Err(BadInput::told(format!("nothing could be solved: {}", why(&source, first))));
     }
     let count = |keep: fn(&Verdict) -> bool| solved.verdicts.iter().filter(|v| keep(v)).count();
     let placed: usize = solved.components.iter().map(BTreeMap::len).sum();
@@ -43,6 +43,13 @@ pub fn solve(args: &SolveArgs) -> Result<bool> {
         solved.map.dof,
         if solved.map.converged { "converged" } else { "NOT CONVERGED" },
     ))?;
+    if !solved.map.converged {
+        warn(&format!(
+            "not converged after {} iterations: give it more (--iterations); until then poses and covariances are \
+             provisional",
+            args.iterations
+        ));
+    }
     reasons(&solved).into_iter().try_for_each(|line| say(&line))?;
     for part in unsolved.iter().take(UNSOLVED_SHOWN) {
         warn(&why(&source, part));

@@ -33,6 +33,9 @@ pub fn solve(args: &SolveArgs) -> Result<bool> {
             unsigned(out.solution.chi2),
             out.solution.dof,
         ))?;
+        if !out.solution.converged {
+            warn(&not_converged(args, k + 1));
+        }
         if let Some(outcome) = &certified {
             say(&certificate_line(part, outcome))?;
         }
@@ -75,6 +78,20 @@ fn placed(args: &SolveArgs, part: &PoseGraph, out: &Solved) -> Option<Part> {
         covariances.extend(out.marginals_from(place));
     }
     Some(Part { origin, poses, covariances })
+}
+
+/// What is wrong and what may help: more iterations, another start, or fewer contradictions.
+fn not_converged(args: &SolveArgs, part: usize) -> String {
+    let elsewhere = match (args.certify, args.start) {
+        (true, _) => "",
+        (false, StartArg::Chordal) => ", start from the certified minimum (--certify)",
+        (false, _) => ", start elsewhere (--start chordal, or --certify)",
+    };
+    format!(
+        "part {part} is not at a minimum after {}: give it more (--iterations){elsewhere}, or leave out what contradicts \
+         the rest (--robust); until then poses and covariances are provisional",
+        counted(args.iterations as usize, "iteration")
+    )
 }
 
 fn certificate_line(part: &PoseGraph, outcome: &ChordalOutcome) -> String {

@@ -36,7 +36,8 @@ pub struct GraphBench {
     /// Only graphs whose name contains this
     #[arg(long, value_name = "STR", default_value = "")]
     pub filter: String,
-    /// Measure GTSAM on the same graphs, in this Python interpreter; with --spoil, its GNC and PCM
+    /// Measure GTSAM on the same graphs, in this Python interpreter; with --spoil, its GNC and PCM. Where it fails on a
+    /// graph, that is told and the bench goes on
     #[arg(long, value_name = "PYTHON")]
     pub peer_python: Option<PathBuf>,
     /// Replace this share of the closures between robots by random ones, %, and solve robustly instead. Exit code 1 if
@@ -74,6 +75,7 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
     let Some(data) = &options.data else { anyhow::bail!("give --data or --scale") };
     let optima = files::optima(data)?;
     let sources = files::find(data, &optima, &options.filter)?;
+    options.peer_python.as_deref().map_or(Ok(()), peer::expect)?;
     let bar = progress_bar(sources.len() as u64, "graphs")?;
     if let Some(percent) = options.spoil {
         let mut rows = Vec::new();
@@ -104,12 +106,12 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
         }
         let measured = measure::measure(&graph, options.repeats)?;
         let peer = match options.peer_python.as_deref().zip(source.one_file()).filter(|_| !isotropic) {
-            Some((python, file)) => Some(peer::measure(python, file, options.repeats)?),
+            Some((python, file)) => peer::or_told(peer::measure(python, file, options.repeats), &source.name),
             None => None,
         };
         let is_small = graph.poses.len() <= peer_marginals::GRAPH_POSES_MAX && !graph.planar;
         let marginals = match options.peer_python.as_deref().filter(|_| is_small && !isotropic) {
-            Some(python) => Some(peer_marginals::difference(python, &graph, &measured.values)?),
+            Some(python) => peer_marginals::difference(python, &source.name, &graph, &measured.values)?,
             None => None,
         };
         let (name, optimum) = (source.name.clone(), optima.get(&source.name).copied());
@@ -119,4 +121,41 @@ pub fn run(options: &GraphBench) -> anyhow::Result<bool> {
     bar.finish_and_clear();
     write!(std::io::stdout().lock(), "{}", table::table(&rows))?;
     Ok(rows.iter().all(table::Row::is_good))
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+    use std::fs;
+    use std::os::unix::fs::PermissionsExt;
+
+    /// A chain of three poses, and a peer that is there and fails on every graph.
+    #[test]
+    fn a_peer_that_fails_on_a_graph_ends_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let edge =
+            |i: u32| format!("EDGE_SE3:QUAT {i} {} 1 0 0 0 0 0 1 9 0 0 0 0 0 9 0 0 0 0 9 0 0 0 9 0 0 9 0 9\n", i + 1);
+        let vertex = |i: u32| format!("VERTEX_SE3:QUAT {i} {i} 0 0 0 0 0 1\n");
+        let text: String = (0..3).map(vertex).chain((0..2).map(edge)).collect();
+        fs::write(dir.path().join("chain.g2o"), text).unwrap();
+        let python = dir.path().join("python");
+        let peer = |body: &str| {
+            fs::write(&python, format!("#!/bin/sh\n{body}\n")).unwrap();
+            fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
+            let options = GraphBench {
+                data: Some(dir.path().to_owned()),
+                scale: None,
+                kimera: None,
+                filter: String::new(),
+                peer_python: Some(python.clone()),
+                spoil: None,
+                draws: None,
+                seed: 1,
+                repeats: 1,
+            };
+            run(&options)
+        };
+        assert!(peer("[ \"$2\" = \"import gtsam\" ]").unwrap());
+        assert!(peer("exit 1").unwrap_err().to_string().contains("pip install gtsam"));
+    }
 }

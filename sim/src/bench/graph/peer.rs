@@ -3,6 +3,7 @@
 use anyhow::{Context, bail};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
+use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -16,6 +17,28 @@ pub(super) struct Peer {
     pub(super) solve_s: f64,
     /// All covariances, extrapolated from some where it takes long.
     pub(super) marginals_s: f64,
+}
+
+/// Tries whether there is a peer at all, before the first graph is measured.
+///
+/// # Errors
+/// An interpreter that does not start, or that has no GTSAM.
+pub(super) fn expect(python: &Path) -> anyhow::Result<()> {
+    let output = Command::new(python).args(["-c", "import gtsam"]).output();
+    let output = output.with_context(|| format!("{}: no Python interpreter starts there", python.display()))?;
+    if !output.status.success() {
+        bail!("{}: has no GTSAM: pip install gtsam", python.display());
+    }
+    Ok(())
+}
+
+/// What a peer came to on a graph. Where it fails, that is told, and the other graphs are measured nevertheless.
+pub(super) fn or_told<T>(peer: anyhow::Result<T>, graph: &str) -> Option<T> {
+    let tell = |error: &anyhow::Error| {
+        // Nowhere left to say that it cannot be said.
+        let _ = writeln!(std::io::stderr().lock(), "{graph}: no figures of the peer: {error:#}");
+    };
+    peer.inspect_err(tell).ok()
 }
 
 /// Solves `file` with GTSAM.

@@ -3,7 +3,7 @@
 //! GTSAM leaves out the Jacobian of a measurement's logarithm, which is the identity where residuals vanish. So the
 //! graph compared is the file's with every measurement replaced by what the solved poses say of it.
 
-use super::peer::json_line;
+use super::peer::{json_line, or_told};
 use anyhow::Context;
 use merganser_protocol::estimate::posegraph::{Measurement, PoseGraph, g2o};
 use merganser_protocol::geometry::Se3;
@@ -26,11 +26,17 @@ struct Output {
     covariances: Vec<(u64, Vec<f64>)>,
 }
 
-/// The largest difference of a covariance's element, relative to its standard deviations, and the poses compared.
+/// The largest difference of a covariance's element, relative to its standard deviations, and the poses compared. `None`
+/// where the peer fails.
 ///
 /// # Errors
-/// A graph that cannot be solved, an interpreter without GTSAM, or output that cannot be read.
-pub(super) fn difference(python: &Path, graph: &PoseGraph, values: &[Se3]) -> anyhow::Result<(f64, usize)> {
+/// A graph that cannot be solved, or a peer that names poses that are not there.
+pub(super) fn difference(
+    python: &Path,
+    name: &str,
+    graph: &PoseGraph,
+    values: &[Se3],
+) -> anyhow::Result<Option<(f64, usize)>> {
     let exact = without_residuals(graph, values);
     let ours: BTreeMap<u64, Matrix6<f64>> =
         exact.solve(values, 0)?.marginals().into_iter().map(|(id, c)| (id, *c.matrix())).collect();
@@ -38,13 +44,13 @@ pub(super) fn difference(python: &Path, graph: &PoseGraph, values: &[Se3]) -> an
     std::fs::write(&file, g2o::write(&exact)).with_context(|| file.display().to_string())?;
     let output = Command::new(python).args(["-c", SCRIPT]).arg(&file).arg(POSES.to_string()).output();
     std::fs::remove_file(&file).with_context(|| file.display().to_string())?;
-    let theirs: Output = json_line(python, &file, output)?;
+    let Some(theirs) = or_told(json_line::<Output>(python, &file, output), name) else { return Ok(None) };
     let mut worst = 0.0_f64;
     for (id, numbers) in &theirs.covariances {
         let own = ours.get(id).with_context(|| format!("the peer names pose {id}"))?;
         worst = worst.max(apart(own, numbers).context("the peer's covariance is no 6 × 6 matrix")?);
     }
-    Ok((worst, theirs.covariances.len()))
+    Ok(Some((worst, theirs.covariances.len())))
 }
 
 fn apart(own: &Matrix6<f64>, numbers: &[f64]) -> Option<f64> {

@@ -3,6 +3,7 @@
 
 use super::ate::{anees, ate};
 use super::files::Source;
+use super::peer::or_told;
 use super::peer_robust;
 use crate::bench::cpu::thread_seconds;
 use merganser_protocol::config::EstimateConfig;
@@ -98,7 +99,7 @@ pub(super) fn measure(
     let is_used = |k: usize| matches!(out.verdicts[k], Verdict::Used(_));
     let mut answers = vec![answer("merganser".to_owned(), &is_used, ate(&reference, &all), cpu_s)];
     if let Some(python) = python {
-        for peer in peer_robust::measure(python, &graph)? {
+        for peer in or_told(peer_robust::measure(python, &graph), &source.name).unwrap_or_default() {
             let used = |k: usize| peer.used.binary_search(&k).is_ok();
             let ate = ate(&reference, &peer.poses());
             answers.push(answer(peer.name.clone(), &used, ate, peer.cpu_s));
