@@ -162,10 +162,16 @@ impl Inbox {
 impl Outbox {
     /// The next input, what the core waits for first; `None` when all senders are gone.
     pub async fn next(&mut self) -> Option<Input> {
+        // Not within `select!`, which takes from every branch before it chooses one: what it took from here would be gone.
+        if let Ok(input) = self.inside.try_recv() {
+            return Some(input);
+        }
+        if let Some(input) = self.next.pop_front() {
+            return Some(input);
+        }
         tokio::select! {
             biased;
             Some(input) = self.inside.recv() => Some(input),
-            Some(input) = std::future::ready(self.next.pop_front()) => Some(input),
             Some(mut queued) = self.outside.recv() => {
                 let lost = std::mem::take(&mut queued.lost).into_iter();
                 self.next.extend(lost.map(|(why, count)| Input::KeyframesLost { why, count }));
@@ -323,6 +329,22 @@ mod tests {
             place: None,
             up: None,
         })
+    }
+
+    /// A loss and the keyframe behind it come out of the queue together; what the core waits for may come between them.
+    #[tokio::test]
+    async fn nothing_is_lost_where_the_core_is_answered_between_a_loss_and_its_keyframe() {
+        let (inbox, mut outbox) = queue(2);
+        assert!(inbox.offer(Source::Own, keyframe(1)) && inbox.offer(Source::Own, keyframe(2)));
+        inbox.lose(Loss::Unreadable); // there is no room to say so
+        assert!(matches!(outbox.next().await, Some(Input::Keyframe(_))));
+        assert!(inbox.offer(Source::Own, keyframe(3)));
+        assert!(matches!(outbox.next().await, Some(Input::Keyframe(_))));
+        assert!(matches!(outbox.next().await, Some(Input::KeyframesLost { why: Loss::Unreadable, count: 1 })));
+        inbox.deliver(Input::Timeout);
+        assert!(matches!(outbox.next().await, Some(Input::Timeout)));
+        let third = tokio::time::timeout(Duration::from_secs(5), outbox.next()).await;
+        assert!(matches!(third, Ok(Some(Input::Keyframe(keyframe))) if keyframe.stamp == Stamp(3)));
     }
 
     /// A loss is told where it happened, be the queue full or not.

@@ -43,12 +43,12 @@ impl Verdicts {
         config: &EstimateConfig,
         judge: impl Fn((FrameId, FrameId), &[usize]) -> Verdict,
     ) -> Vec<Verdict> {
-        let before = core::mem::take(self);
+        let mut before = core::mem::take(self).of;
         let ways: BTreeMap<FrameId, Way> =
             pairs.keys().flat_map(|&(a, b)| [a, b]).map(|f| (f, Way::of(&admission.chains[&f]))).collect();
         let verdict = |(&pair, members): (&(FrameId, FrameId), &Vec<usize>)| {
             let digest = digest(pair, members, admission, &ways, config);
-            let known = before.of.get(&pair).filter(|(of, _)| *of == digest).map(|(_, verdict)| verdict.clone());
+            let known = before.remove(&pair).filter(|(of, _)| *of == digest).map(|(_, verdict)| verdict);
             self.recalled += usize::from(known.is_some());
             let verdict = known.unwrap_or_else(|| judge(pair, members));
             self.of.insert(pair, (digest, verdict.clone()));

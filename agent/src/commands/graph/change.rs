@@ -3,7 +3,7 @@
 use super::read::{self, Source};
 use super::write::write;
 use super::{BadInput, SplitArgs, counted, say};
-use anyhow::{Context, Result};
+use anyhow::Result;
 use merganser_protocol::estimate::posegraph::g2o::number_of;
 use merganser_protocol::estimate::posegraph::robust::robot_of;
 use merganser_protocol::estimate::posegraph::{Measurement, PoseGraph, g2o};
@@ -53,8 +53,9 @@ pub fn split(args: &SplitArgs) -> Result<bool> {
 /// Makes a graph of Kimera-Multi's tables.
 pub fn import_kimera(folder: &Path, out: &Path) -> Result<bool> {
     let mut tables = Vec::new();
-    for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
-        let path = entry.with_context(|| folder.display().to_string())?.path().join("measurements.csv");
+    let unread = |error: std::io::Error| BadInput::told(format!("{}: {error}", folder.display()));
+    for entry in std::fs::read_dir(folder).map_err(unread)? {
+        let path = entry.map_err(unread)?.path().join("measurements.csv");
         if path.is_file() {
             tables.push(path);
         }
