@@ -70,6 +70,11 @@ fn nothing_is_recalled_that_follows_from_something_else() {
     assert_eq!(changed(&|p| p.alignments.truncate(4)), 0);
     assert_eq!(changed(&|p| p.alignments[0].t_i_j = a.t_i_j.widened(1.0 + 1e-9)), 0);
     assert_eq!(changed(&|p| p.frames.get_mut(&frame(0)).unwrap().odometry[1].pose.translation[0] += 1e-9), 0);
+    let first = |p: &mut MapProblem, change: &dyn Fn(&mut PoseWithCovariance)| {
+        change(&mut p.frames.get_mut(&frame(0)).unwrap().odometry[0]);
+    };
+    // The box stays.
+    assert_eq!(changed(&|p| first(p, &|step| step.covariance = step.covariance.scaled(1.0 + 1e-9))), 0);
     assert_eq!(changed(&|p| p.common = [(a.entry, 0.1)].into()), 0);
     // A way that goes on fills a larger box; a robot that stands does not.
     let onward = |metres: f64| {
