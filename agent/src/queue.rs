@@ -2,23 +2,29 @@
 //! does not fit is dropped and counted: a flooding peer can neither stop the core nor crowd out the others. What the
 //! core itself asked for (results, answers, durability) always fits, because the core bounds how much it asks for.
 
-use merganser_protocol::agent::io::Input;
+use merganser_protocol::agent::io::{Input, QueryId};
 use merganser_protocol::ids::Name;
 use merganser_protocol::submap::Loss;
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::sync::mpsc;
 
 /// Bytes of waiting outside input at most.
 pub const QUEUED_BYTES_MAX: usize = 32 << 20;
+/// Bytes of waiting answers to questions of ours at most. Anyone may answer, so they are bounded; what is left of room
+/// is enough for [`MESSAGE_LEN_MAX`](merganser_protocol::wire::limits::MESSAGE_LEN_MAX) bytes for each question under
+/// way.
+pub const ANSWERS_BYTES_MAX: usize = 8 << 20;
 /// A single source may fill this part of the queue: one in so many.
 const SHARE: usize = 4;
 /// Time between two looks for room in bytes.
 const FEED_WAIT: Duration = Duration::from_millis(2);
 /// Different reasons counted at most; the rest counts as one.
 const REASONS_MAX: usize = 64;
+/// Counters that name a robot at most. Whoever invents names cannot fill the counters of other reasons.
+const NAMES_MAX: usize = 64;
 
 /// Whose input it is, for fairness.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -35,8 +41,10 @@ pub enum Source {
 #[derive(Clone, Debug)]
 pub struct Inbox {
     outside: mpsc::Sender<Queued>,
-    inside: mpsc::UnboundedSender<Input>,
+    inside: mpsc::UnboundedSender<(Input, Option<Room>)>,
     load: Arc<Load>,
+    /// Bytes of answers that wait.
+    answers: Arc<AtomicUsize>,
     /// What was dropped, and why.
     pub drops: Arc<Drops>,
     /// Keyframes that were lost since the last one that was taken and that the core was not told of.
@@ -47,7 +55,7 @@ pub struct Inbox {
 #[derive(Debug)]
 pub struct Outbox {
     outside: mpsc::Receiver<Queued>,
-    inside: mpsc::UnboundedReceiver<Input>,
+    inside: mpsc::UnboundedReceiver<(Input, Option<Room>)>,
     /// What comes before the input that was received last, then that input.
     next: VecDeque<Input>,
 }
@@ -77,12 +85,26 @@ impl Drop for Queued {
     }
 }
 
+/// Room that a waiting answer takes until it is taken.
+#[derive(Debug)]
+struct Room {
+    bytes: usize,
+    of: Arc<AtomicUsize>,
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.of.fetch_sub(self.bytes, Relaxed);
+    }
+}
+
 /// A queue for `length` outside inputs.
 pub fn queue(length: usize) -> (Inbox, Outbox) {
     let (outside, outside_end) = mpsc::channel(length.max(1));
     let (inside, inside_end) = mpsc::unbounded_channel();
     let load = Load { length_max: length, bytes: AtomicUsize::new(0), by_source: Mutex::default() };
-    let inbox = Inbox { outside, inside, load: Arc::new(load), drops: Arc::default(), lost: Arc::default() };
+    let (load, answers) = (Arc::new(load), Arc::default());
+    let inbox = Inbox { outside, inside, load, answers, drops: Arc::default(), lost: Arc::default() };
     (inbox, Outbox { outside: outside_end, inside: inside_end, next: VecDeque::new() })
 }
 
@@ -98,7 +120,7 @@ impl Inbox {
         if is_keyframe {
             self.owe(Loss::QueueFull, 1);
         }
-        self.drops.count(format!("queue full: {label}"));
+        self.drops.count_named(format!("queue full: {label}"), "queue full: others");
         false
     }
 
@@ -155,7 +177,16 @@ impl Inbox {
 
     /// Puts in what the core waits for: the result of something it asked for.
     pub fn deliver(&self, input: Input) {
-        let _ = self.inside.send(input); // fails only when the driver has ended
+        let _ = self.inside.send((input, None)); // fails only when the driver has ended
+    }
+
+    /// Puts in an answer to a question of ours, in order with [`Inbox::deliver`], or drops and counts it.
+    pub fn answer(&self, query: QueryId, bytes: Vec<u8>) {
+        let room = Room { bytes: bytes.len() + 128, of: self.answers.clone() };
+        if self.answers.fetch_add(room.bytes, Relaxed) + room.bytes > ANSWERS_BYTES_MAX {
+            return self.drops.count("queue full: answers");
+        }
+        let _ = self.inside.send((Input::Answered { query, bytes: Some(bytes) }, Some(room)));
     }
 }
 
@@ -163,7 +194,7 @@ impl Outbox {
     /// The next input, what the core waits for first; `None` when all senders are gone.
     pub async fn next(&mut self) -> Option<Input> {
         // Not within `select!`, which takes from every branch before it chooses one: what it took from here would be gone.
-        if let Ok(input) = self.inside.try_recv() {
+        if let Ok((input, _)) = self.inside.try_recv() {
             return Some(input);
         }
         if let Some(input) = self.next.pop_front() {
@@ -171,7 +202,7 @@ impl Outbox {
         }
         tokio::select! {
             biased;
-            Some(input) = self.inside.recv() => Some(input),
+            Some((input, _)) = self.inside.recv() => Some(input),
             Some(mut queued) = self.outside.recv() => {
                 let lost = std::mem::take(&mut queued.lost).into_iter();
                 self.next.extend(lost.map(|(why, count)| Input::KeyframesLost { why, count }));
@@ -216,7 +247,12 @@ fn weight(input: &Input) -> usize {
 /// Counters of what was dropped or refused at the edge, by reason. Reasons name robots of the roster or fixed texts, so
 /// there are few; a bound holds all the same.
 #[derive(Debug, Default)]
-pub struct Drops(Mutex<BTreeMap<String, Arc<AtomicU64>>>);
+pub struct Drops {
+    reasons: Mutex<Counters>,
+    named: Mutex<Counters>,
+}
+
+type Counters = BTreeMap<String, u64>;
 
 impl Drops {
     /// Counts one.
@@ -226,18 +262,20 @@ impl Drops {
 
     /// Counts one; whether it is the first that is counted for this reason.
     pub fn count_first(&self, reason: impl Into<String>) -> bool {
-        let mut counters = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut reason = reason.into();
-        if counters.len() >= REASONS_MAX && !counters.contains_key(&reason) {
-            reason = "other".into();
-        }
-        counters.entry(reason).or_default().fetch_add(1, Relaxed) == 0
+        count(&self.reasons, reason.into(), REASONS_MAX, "other")
+    }
+
+    /// Counts one under a text that names a robot, or, if too many are named already, under `others`.
+    pub fn count_named(&self, reason: String, others: &str) {
+        count(&self.named, reason, NAMES_MAX, others);
     }
 
     /// All counters.
     pub fn counts(&self) -> BTreeMap<String, u64> {
-        let counters = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        counters.iter().map(|(reason, count)| (reason.clone(), count.load(Relaxed))).collect()
+        let of = |counters: &Mutex<Counters>| counters.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let mut all = of(&self.named);
+        all.append(&mut of(&self.reasons));
+        all
     }
 
     /// One line for each reason that was counted since the last call with the same `seen`.
@@ -253,10 +291,20 @@ impl Drops {
     }
 }
 
+fn count(counters: &Mutex<Counters>, mut reason: String, limit: usize, rest: &str) -> bool {
+    let mut counters = counters.lock().unwrap_or_else(PoisonError::into_inner);
+    if counters.len() >= limit && !counters.contains_key(&reason) {
+        reason = rest.into();
+    }
+    let count = counters.entry(reason).or_default();
+    *count = count.saturating_add(1);
+    *count == 1
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use merganser_protocol::agent::io::{Channel, Command, QueryId};
+    use merganser_protocol::agent::io::{Channel, Command};
     use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
     use merganser_protocol::ids::RobotId;
     use merganser_protocol::submap::{CovarianceOf, Keyframe};
@@ -289,6 +337,26 @@ mod tests {
             rest += 1;
         }
         assert_eq!(rest, 16);
+    }
+
+    #[tokio::test]
+    async fn answers_are_bounded_and_their_end_is_not() {
+        let (inbox, mut outbox) = queue(16);
+        let half = ANSWERS_BYTES_MAX / 2 - 128;
+        let told = |number| Input::Answered { query: QueryId(number), bytes: None };
+        for (number, len) in [(1, half), (2, half), (3, 0)] {
+            inbox.answer(QueryId(number), vec![0; len]);
+            inbox.deliver(told(number));
+        }
+        assert_eq!(inbox.drops.counts()["queue full: answers"], 1);
+        let mut order = Vec::new();
+        for _ in 0..5 {
+            let Some(Input::Answered { query, bytes }) = outbox.next().await else { panic!() };
+            order.push((query.0, bytes.is_some()));
+        }
+        assert_eq!(order, [(1, true), (1, false), (2, true), (2, false), (3, false)]);
+        inbox.answer(QueryId(4), vec![0; ANSWERS_BYTES_MAX - 128]);
+        assert!(matches!(outbox.next().await, Some(Input::Answered { bytes: Some(_), .. })), "there is room again");
     }
 
     #[tokio::test]
@@ -399,6 +467,11 @@ mod tests {
         assert_eq!(drops.counts()["other"], 1000 - REASONS_MAX as u64);
         assert!(!drops.count_first("reason 0") && !drops.count_first("one more, counted as another"));
         assert!(Drops::default().count_first("reason 0"));
+        let named = Drops::default();
+        (0..1000).for_each(|i| named.count_named(format!("ignored: {i}"), "ignored: others"));
+        assert_eq!(named.counts().len(), NAMES_MAX + 1);
+        assert_eq!(named.counts()["ignored: others"], 1000 - NAMES_MAX as u64);
+        assert!(named.count_first("a reason of its own") && named.counts()["a reason of its own"] == 1);
         let mut seen = BTreeMap::new();
         assert_eq!(drops.news(&mut seen).len(), REASONS_MAX + 1);
         assert!(drops.news(&mut seen).is_empty());

@@ -85,6 +85,51 @@ async fn channels_questions_and_presence_cross_the_network_unchanged() {
     alpha.stop().await.unwrap();
 }
 
+/// Anyone may answer in another's name, and call himself complete; whoever was asked is heard all the same.
+#[tokio::test(flavor = "multi_thread")]
+async fn whoever_answers_in_anothers_name_silences_nobody() {
+    let dir = tempfile::tempdir().unwrap();
+    let configs = swarm(dir.path(), &["alpha", "beta"]);
+    let (a, b) = (Puppet::default(), Puppet { answers: true, ..Puppet::default() });
+    let alpha = puppet(&configs[0], &a).await;
+    let beta = puppet(&configs[1], &b).await;
+    let outsider = onlooker(&configs[0]).await;
+    let mut stolen = Vec::new();
+    for kind in keys::QUERIES {
+        let key = keys::of(&name("test"), &name("beta"), keys::query(kind));
+        let (sender, receiver) = std::sync::mpsc::channel();
+        let answer = move |query: zenoh::query::Query| {
+            use zenoh::Wait as _;
+            for _ in 0..3 {
+                query.reply(query.key_expr().clone(), vec![9]).wait().unwrap();
+            }
+            sender.send(()).unwrap();
+        };
+        outsider.declare_queryable(key).complete(true).callback(answer).background().await.unwrap();
+        stolen.push(receiver);
+    }
+    let mut number = 0;
+    for (kind, stolen) in keys::QUERIES.into_iter().zip(stolen) {
+        until("a question that both answer", async || {
+            number += 1;
+            let query = QueryId(number);
+            a.say(Output::Ask { query, peer: id(&configs[1]), kind, bytes: vec![1, 2] });
+            let of = |input: &Input| match input {
+                Input::Answered { query: of, bytes } if *of == query => Some(bytes.clone()),
+                _ => None,
+            };
+            until("the end of a question", async || a.has_heard(|input| of(input) == Some(None))).await;
+            let heard: Vec<_> = a.heard.lock().unwrap().iter().filter_map(of).collect();
+            assert_eq!(heard.iter().position(Option::is_none), Some(heard.len() - 1), "the end comes once, and last");
+            let is_heard = |bytes: &[u8]| heard.iter().flatten().any(|answer| answer == bytes);
+            stolen.try_recv().is_ok() && is_heard(&[9]) && is_heard(&[2, 1])
+        })
+        .await;
+    }
+    alpha.stop().await.unwrap();
+    beta.stop().await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_flood_is_dropped_and_counted_while_the_core_keeps_answering() {
     let dir = tempfile::tempdir().unwrap();
@@ -106,7 +151,7 @@ async fn a_flood_is_dropped_and_counted_while_the_core_keeps_answering() {
     .await;
     let answer = |input: &Input| matches!(input, Input::Answered { bytes: Some(bytes), .. } if *bytes == [5]);
     until("an answer through the flood", async || a.has_heard(answer)).await;
-    let ends = |input: &Input| matches!(input, Input::Answered { .. });
+    let ends = |input: &Input| matches!(input, Input::Answered { bytes: None, .. });
     until("every question ended", async || a.heard.lock().unwrap().iter().filter(|i| ends(i)).count() as u64 == asked)
         .await;
     alpha.stop().await.unwrap();

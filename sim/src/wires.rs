@@ -223,7 +223,9 @@ impl Wires {
                 let lost = self.is_lost();
                 let other = self.agents.iter().position(|agent| agent.robot() == peer && !lost);
                 let bytes = other.and_then(|other| self.ask(other, Input::Asked { token, kind, bytes }, token));
-                self.inbox.push_back((robot, Input::Answered { query, bytes }));
+                for bytes in bytes.into_iter().map(Some).chain([None]) {
+                    self.inbox.push_back((robot, Input::Answered { query, bytes }));
+                }
             }
             Output::Answer { .. } => {}
             Output::Event(event) => self.events.push((robot, event)),

@@ -58,10 +58,12 @@ pub(super) async fn start(shared: &Arc<Shared>) -> Result<JoinHandle<()>, LinkEr
 
 fn broadcast(shared: &Shared, present: &watch::Sender<BTreeSet<RobotId>>, channel: Channel, sample: &Sample) {
     let Some((name, from)) = sender(shared, sample) else {
-        return shared.drops().count(format!("refused: broadcast of {}, who is not in the roster", stranger(sample)));
+        let reason = format!("refused: broadcast of {}, who is not in the roster", stranger(sample));
+        return shared.drops().count_named(reason, "refused: broadcast of others who are not in the roster");
     };
     if sample.payload().len() > PEER_BYTES_MAX {
-        return shared.drops().count(format!("refused: {name} broadcast more than {PEER_BYTES_MAX} bytes"));
+        let reason = format!("refused: {name} broadcast more than {PEER_BYTES_MAX} bytes");
+        return shared.drops().count_named(reason, "refused: others broadcast too much at once");
     }
     if from != shared.ids[&shared.robot] {
         present.send_if_modified(|robots| robots.insert(from)); // who speaks is there
@@ -138,7 +140,8 @@ fn refuse(shared: &Shared, input: &str, kind: &str, reason: &str) {
 
 fn alive(shared: &Shared, present: &watch::Sender<BTreeSet<RobotId>>, sample: &Sample) {
     let Some((name, robot)) = sender(shared, sample) else {
-        return shared.drops().count(format!("ignored: {} is alive, who is not in the roster", stranger(sample)));
+        let reason = format!("ignored: {} is alive, who is not in the roster", stranger(sample));
+        return shared.drops().count_named(reason, "ignored: others are alive who are not in the roster");
     };
     if name != shared.robot {
         present.send_if_modified(|robots| match sample.kind() {

@@ -1,6 +1,6 @@
 //! Zenoh on one side, the core's inputs and outputs on the other. Callbacks only copy into our bounded queue and
 //! return, because an undrained handler blocks the whole link; what is sent leaves from a thread of its own, because
-//! sending may wait for a slow neighbour; every question ends in exactly one `Input::Answered`.
+//! sending may wait for a slow neighbour; every question ends in exactly one `Input::Answered` without bytes.
 
 mod hear;
 mod say;

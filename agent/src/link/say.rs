@@ -8,13 +8,13 @@ use crate::keys;
 use merganser_protocol::agent::io::{AskToken, Channel, Input, QueryId, QueryKind};
 use merganser_protocol::ids::RobotId;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use zenoh::Wait;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
-use zenoh::query::{ConsolidationMode, Reply};
+use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::sample::Locality;
 
 /// Messages that may wait to be sent.
@@ -88,7 +88,7 @@ fn send_all(
 
 fn ask(shared: &Shared, query: QueryId, peer: RobotId, kind: QueryKind, bytes: Vec<u8>, wait: Duration) {
     let bytes_max = shared.message_bytes_max;
-    let outcome = Outcome { query, bytes_max, shared_inbox: shared.inbox.clone(), open: Mutex::new(true) };
+    let outcome = Outcome { query, bytes_max, inbox: shared.inbox.clone() };
     let Some(name) = shared.names.get(&peer) else {
         return shared.drops().count("not asked: nobody in the roster has this id"); // `outcome` says so to the core
     };
@@ -101,6 +101,7 @@ fn ask(shared: &Shared, query: QueryId, peer: RobotId, kind: QueryKind, bytes: V
         .congestion_control(CongestionControl::Drop)
         .priority(keys::query_priority(kind))
         .consolidation(ConsolidationMode::None)
+        .target(QueryTarget::All) // else whoever calls himself complete is asked alone
         .allowed_destination(Locality::Remote)
         .timeout(wait)
         .callback(move |reply| outcome.take(&reply))
@@ -110,13 +111,12 @@ fn ask(shared: &Shared, query: QueryId, peer: RobotId, kind: QueryKind, bytes: V
     }
 }
 
-/// Tells the core the answer of one question, once: the first good reply, or `None` when Zenoh lets go of the callback
-/// without one (nobody there, refused, too late).
+/// Tells the core each answer to one question, and at the end, when Zenoh lets go of the callback (all have answered, nobody
+/// is there, or it is too late), that there will be no more. Anyone may answer; the core knows which answer is good.
 struct Outcome {
     query: QueryId,
     bytes_max: usize,
-    shared_inbox: crate::queue::Inbox,
-    open: Mutex<bool>,
+    inbox: crate::queue::Inbox,
 }
 
 impl Outcome {
@@ -124,22 +124,15 @@ impl Outcome {
         if let Ok(sample) = reply.result() {
             if sample.payload().len() > self.bytes_max {
                 let reason = "refused: an answer larger than zenoh.message_bytes_max";
-                return self.shared_inbox.drops.count(reason);
+                return self.inbox.drops.count(reason);
             }
-            self.settle(Some(sample.payload().to_bytes().into_owned()));
-        }
-    }
-
-    fn settle(&self, bytes: Option<Vec<u8>>) {
-        let mut open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
-        if std::mem::take(&mut *open) {
-            self.shared_inbox.deliver(Input::Answered { query: self.query, bytes });
+            self.inbox.answer(self.query, sample.payload().to_bytes().into_owned());
         }
     }
 }
 
 impl Drop for Outcome {
     fn drop(&mut self) {
-        self.settle(None);
+        self.inbox.deliver(Input::Answered { query: self.query, bytes: None });
     }
 }

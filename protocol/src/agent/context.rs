@@ -119,12 +119,20 @@ impl Context {
         self.put(Output::Event(event));
     }
 
-    /// Counts a refusal and reports it, at most once per peer and interval.
+    /// Counts a refusal and reports it, at most once per peer, reason and interval. `peer` is whoever signed what is
+    /// refused, if anybody did.
     pub(super) fn reject(&mut self, peer: Option<RobotId>, reason: &'static str, detail: &str) {
         if let Some(suppressed) = self.stats.rejected(self.now, peer, reason) {
             let name = peer.map_or_else(|| "unknown".to_owned(), |peer| self.robot_name(peer));
             self.event(Event::Rejected { peer, name, reason: format!("{reason}: {detail}"), suppressed });
         }
+    }
+
+    /// Refuses what is not signed: whoever sent it, `named` is the robot that it was sent in the name of, or that was
+    /// asked, and is not blamed.
+    pub(super) fn reject_unsigned(&mut self, named: RobotId, reason: &'static str, detail: &str) {
+        let name = self.robot_name(named);
+        self.reject(None, reason, &format!("{detail} (unsigned, in the name of {name})"));
     }
 
     pub(super) fn run_job(&mut self, job: Job) -> JobId {

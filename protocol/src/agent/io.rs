@@ -78,11 +78,12 @@ pub enum Input {
         /// The framed message.
         bytes: Vec<u8>,
     },
-    /// Our question was answered, or failed or timed out in the shell (`None`).
+    /// Our question was answered, or will have no more answers (`None`): exactly once, at the end, whether or not there
+    /// were any. Where anyone may answer in another's name there may be several; the core takes what proves itself.
     Answered {
         /// Which question.
         query: QueryId,
-        /// The framed answer.
+        /// A framed answer.
         bytes: Option<Vec<u8>>,
     },
     /// A peer appeared or vanished (liveliness).
@@ -170,7 +171,7 @@ pub enum Output {
         /// The framed message.
         bytes: Vec<u8>,
     },
-    /// Ask one peer; answer with [`Input::Answered`] in any case.
+    /// Ask one peer, and whoever else answers for it; end with an [`Input::Answered`] without bytes in any case.
     Ask {
         /// To be handed back.
         query: QueryId,

@@ -223,34 +223,25 @@ impl Agent {
     pub(super) fn on_answered(&mut self, query: QueryId, bytes: Option<&[u8]>) {
         match self.replication.on_answered(&mut self.context, query, bytes) {
             Reply::Nothing => {}
-            Reply::Delta(question, delta) => {
+            Reply::Delta(peer, delta) => {
                 let mut new = 0;
                 for entry in &delta.entries {
-                    new += usize::from(self.ingest(question.peer, &entry.0));
+                    new += usize::from(self.ingest(peer, &entry.0));
                 }
                 for proof in &delta.forks {
-                    new += usize::from(self.ingest_fork(question.peer, proof));
+                    new += usize::from(self.ingest_fork(peer, proof));
                 }
-                self.replication.on_delta(&self.context, &question, &delta, new);
+                self.replication.on_delta(&self.context, query, &delta, new);
             }
-            Reply::Piece { peer, hash, offset, total, bytes } => {
+            Reply::Piece { hash, offset, total, bytes } => {
                 let moments = [self.context.now(), self.replication.next_piece()];
                 if let Some(bytes) = self.alignment.on_piece(query, hash, (offset, total), &bytes, moments) {
-                    self.on_blob(query, peer, hash, bytes);
+                    self.keep_blob(bytes);
+                    self.alignment.on_blob(query, hash, self.context.now());
                 }
             }
             Reply::NoPiece => self.alignment.on_no_piece(query, self.context.now()),
         }
-    }
-
-    /// All pieces of a blob came.
-    fn on_blob(&mut self, query: QueryId, peer: RobotId, hash: Hash, bytes: Vec<u8>) {
-        if Hash::of(&bytes) == hash {
-            self.keep_blob(bytes);
-        } else {
-            self.context.reject(Some(peer), "blob: wrong hash", "the bytes are not those the hash names");
-        }
-        self.alignment.on_blob(query, hash, self.context.now());
     }
 
     /// Keeps a keypoint blob, for whoever asks, and its decoded form.

@@ -1,5 +1,5 @@
 //! Counters, and refusals reported without letting a noisy peer flood the log: every refusal is counted, but a peer is
-//! named in an event at most once per [`REPORT_EVERY`].
+//! named in an event at most once per reason and [`REPORT_EVERY`], so that one reason hides no other.
 
 use crate::gossip::Class;
 use crate::ids::RobotId;
@@ -7,7 +7,7 @@ use crate::time::Instant;
 use core::time::Duration;
 use std::collections::BTreeMap;
 
-/// Shortest time between two reports about one peer.
+/// Shortest time between two reports about one peer and reason.
 pub const REPORT_EVERY: Duration = Duration::from_secs(10);
 /// Peers told apart in the counters; the rest count as one unknown peer. Bounds memory against invented names.
 pub const PEERS_MAX: usize = 1024;
@@ -21,8 +21,10 @@ pub struct Stats {
     pub received: BTreeMap<&'static str, (u64, u64)>,
     /// Refusals by reason.
     pub rejected: BTreeMap<&'static str, u64>,
-    /// Refusals by peer.
-    pub rejected_by_peer: BTreeMap<Option<RobotId>, PeerRejections>,
+    /// Refusals of what a peer signed, by peer, and of what nobody signed.
+    pub rejected_by_peer: BTreeMap<Option<RobotId>, u64>,
+    /// What was reported of them.
+    reports: BTreeMap<(Option<RobotId>, &'static str), Report>,
     /// Work done, by kind.
     pub work: BTreeMap<&'static str, u64>,
     /// What the link's budget held back, by class.
@@ -31,13 +33,11 @@ pub struct Stats {
     pub condensed_bytes: [u64; 2],
 }
 
-/// Refusals of one peer's input.
+/// Refusals of one peer's input for one reason.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct PeerRejections {
-    /// All of them.
-    pub total: u64,
+struct Report {
     suppressed: u64,
-    reported_at: Option<Instant>,
+    at: Option<Instant>,
 }
 
 impl Stats {
@@ -69,18 +69,19 @@ impl Stats {
     }
 
     /// Counts a refusal. `Some(suppressed)` if it should be reported now, with the number of refusals of this peer
-    /// that were counted silently since the last report.
+    /// that were counted silently for this reason since the last report.
     pub fn rejected(&mut self, now: Instant, peer: Option<RobotId>, reason: &'static str) -> Option<u64> {
         *self.rejected.entry(reason).or_default() += 1;
         let known = self.rejected_by_peer.contains_key(&peer) || self.rejected_by_peer.len() < PEERS_MAX;
-        let row = self.rejected_by_peer.entry(if known { peer } else { None }).or_default();
-        row.total += 1;
-        if row.reported_at.is_some_and(|at| now.since(at) < REPORT_EVERY) {
-            row.suppressed += 1;
+        let peer = if known { peer } else { None };
+        *self.rejected_by_peer.entry(peer).or_default() += 1;
+        let report = self.reports.entry((peer, reason)).or_default();
+        if report.at.is_some_and(|at| now.since(at) < REPORT_EVERY) {
+            report.suppressed += 1;
             return None;
         }
-        row.reported_at = Some(now);
-        Some(core::mem::take(&mut row.suppressed))
+        report.at = Some(now);
+        Some(core::mem::take(&mut report.suppressed))
     }
 }
 
@@ -104,8 +105,9 @@ mod tests {
             assert_eq!(stats.rejected(t(5), peer, "bad"), None);
         }
         assert_eq!(stats.rejected(t(10), peer, "bad"), Some(99));
-        assert_eq!(stats.rejected_by_peer[&peer].total, 101);
+        assert_eq!(stats.rejected_by_peer[&peer], 101);
         assert_eq!(stats.rejected["bad"], 101);
+        assert_eq!(stats.rejected(t(11), peer, "worse"), Some(0), "one reason hides no other");
     }
 
     #[test]

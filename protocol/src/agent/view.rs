@@ -290,7 +290,7 @@ impl Agent {
             received_bytes: bytes(&stats.received),
             received_messages: messages(&stats.received),
             rejected: counts(&stats.rejected),
-            rejected_by_peer: stats.rejected_by_peer.iter().map(|(peer, row)| (peer_name(peer), row.total)).collect(),
+            rejected_by_peer: stats.rejected_by_peer.iter().map(|(peer, row)| (peer_name(peer), *row)).collect(),
             work: counts(&stats.work),
             held_back: counts(&stats.held_back),
             condensed_bytes: CondensedView { before: stats.condensed_bytes[0], after: stats.condensed_bytes[1] },

@@ -14,6 +14,9 @@
 //! - **Answering teaches**: the asker's vector says what it has more than we do; those logs are asked for by name.
 //! - An exchange that explained nothing is followed by one with hashes (a fork shows there at the latest), then by a
 //!   pause that doubles until either side changes.
+//! - **Nobody signs announcements**, and an outsider may make them in anyone's name. So a neighbour whose claims came to
+//!   nothing several times in a row waits for the others, and whoever was not asked for a minute is asked in any case,
+//!   less often as long as that brings nothing. Claims thus delay, and starve nobody.
 //! - What goes out is counted against a [`Budget`] by class; a neighbour whose link has no room says so, and is asked
 //!   again later.
 
@@ -130,7 +133,7 @@ impl AntiEntropy {
         if self.neighbours.contains_key(&robot) {
             return false;
         }
-        self.neighbours.insert(robot, Neighbour::default());
+        self.neighbours.insert(robot, Neighbour::new(now));
         self.announce.hurry(now, rng.random_range(0.0..0.1));
         true
     }
@@ -177,6 +180,7 @@ impl AntiEntropy {
     pub fn on_news(&mut self, now: Instant, new: usize) {
         self.wake = now;
         self.experience.news(now);
+        self.neighbours.values_mut().for_each(Neighbour::check_sooner);
         self.announce.news(now, new, self.neighbours.len());
     }
 
@@ -195,7 +199,7 @@ impl AntiEntropy {
         if busy {
             return None; // Durable entries are news, and wake us.
         }
-        let waits = self.neighbours.values().filter_map(|n| n.patience_ends(now, self.answer_max)).min();
+        let waits = self.neighbours.values().filter_map(|n| n.keeps_others_until(now, self.answer_max)).min();
         if let Some(ends) = waits {
             self.wake = self.wake.min(ends);
             return None;
@@ -206,32 +210,60 @@ impl AntiEntropy {
     fn pull(&mut self, now: Instant, replica: &Replica, rng: &mut impl Rng) -> Option<Step> {
         let (root, count) = (replica.root(), replica.count());
         let strangers = self.neighbours.values().filter(|neighbour| neighbour.is_stranger()).count();
-        let mut best: Vec<(RobotId, f64)> = Vec::new();
+        let mut best: Vec<(RobotId, f64, u32)> = Vec::new();
         for (robot, neighbour) in &mut self.neighbours {
+            if let Some(again) = neighbour.patience_ends(now, self.answer_max) {
+                self.wake = self.wake.min(again); // It is not waited for, nor asked once more yet.
+                continue;
+            }
             if let Some(Stake { gain, copies }) = neighbour.lost() {
                 self.bucket.give_back(now, gain, copies);
             }
             match neighbour.promises(now, replica, (root, count), self.me < *robot, strangers) {
-                Ok(gain) => best.push((*robot, neighbour.retry_discount() * gain)),
+                Ok(gain) => best.push((*robot, neighbour.retry_discount() * gain, neighbour.doubt())),
                 Err(again) => self.wake = self.wake.min(again),
             }
         }
-        let most = best.iter().map(|(_, gain)| *gain).fold(0.0, f64::max);
-        if most <= 0.0 {
+        if let Some(step) = self.check(now, replica) {
+            return Some(step);
+        }
+        // Whose claims came to nothing may be somebody else: it waits for those that kept theirs.
+        let doubt = best.iter().map(|(.., doubt)| *doubt).min().unwrap_or(0);
+        best.retain(|(.., of)| *of == doubt);
+        let claimed = best.iter().map(|(_, gain, _)| *gain).fold(0.0, f64::max);
+        if claimed <= 0.0 {
             return None;
         }
+        let most = if doubt > 0 { claimed.min(1.0) } else { claimed };
         let copies = self.experience.copies(now, most);
         let due = self.bucket.due(now, most, copies);
         if now < due {
             self.wake = self.wake.min(due);
             return None;
         }
-        best.retain(|(_, gain)| 2.0 * gain >= most);
-        let (peer, _) = best[rng.random_range(0..best.len())];
+        best.retain(|(_, gain, _)| 2.0 * gain >= claimed);
+        let (peer, ..) = best[rng.random_range(0..best.len())];
         let neighbour = self.neighbours.get_mut(&peer)?;
         self.bucket.pay(now, most, copies);
         self.wake = now;
         let have = neighbour.question(now, self.me, replica, Stake { gain: most, copies });
+        Some(Step::Ask { peer, have })
+    }
+
+    /// Asks who was not asked for long, whatever it is said to hold: nobody signs that, and who says it in another's
+    /// name must not keep us from what that other holds.
+    fn check(&mut self, now: Instant, replica: &Replica) -> Option<Step> {
+        let waiting = self.neighbours.iter().filter(|(_, neighbour)| neighbour.asked.is_none());
+        let (due, peer) = waiting.map(|(robot, neighbour)| (neighbour.check_due(), *robot)).min()?;
+        let due = due.max(self.bucket.due(now, 1.0, 1.0));
+        if now < due {
+            self.wake = self.wake.min(due);
+            return None;
+        }
+        let neighbour = self.neighbours.get_mut(&peer)?;
+        self.bucket.pay(now, 1.0, 1.0);
+        self.wake = now;
+        let have = neighbour.check(now, self.me, replica, Stake { gain: 1.0, copies: 1.0 });
         Some(Step::Ask { peer, have })
     }
 }

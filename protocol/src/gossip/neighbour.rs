@@ -29,6 +29,14 @@ const HOPE: f64 = 0.4;
 const GIVEN_UP_FREE: u32 = 3;
 /// ...so many times at most.
 const GIVEN_UP_MAX: u32 = 4;
+/// Questions in a row that may bring nothing. From then on a neighbour's claims weigh nothing: others come first, it is
+/// asked at the price of a single fact, and waiting for it keeps nobody back for longer than usual.
+const VAIN_FREE: u32 = 3;
+/// A neighbour that was not asked for so long is asked, whatever it is said to hold: what announces itself in its name
+/// may be somebody else...
+pub(super) const CHECK_AFTER: Duration = Duration::from_secs(60);
+/// ...and after checks that brought nothing after twice as long, up to this, until something new is heard.
+pub(super) const CHECK_AFTER_MAX: Duration = Duration::from_secs(480);
 /// Shortest patience with a question: less, and answers that were only queued are fetched twice.
 const PATIENCE_MIN: Duration = Duration::from_millis(300);
 /// Patience with a question for each fact that is expected: of few facts little is lost if they are fetched twice.
@@ -40,7 +48,7 @@ pub(super) struct Neighbour {
     announced: Option<(HaveRoot, Instant)>,
     /// Logs it has more of, as its own vector said.
     pub ahead: Ahead,
-    asked: Option<Question>,
+    pub(super) asked: Option<Question>,
     /// The next vector carries hashes.
     tagged: bool,
     /// It counts by another roster: list the robots.
@@ -59,11 +67,17 @@ pub(super) struct Neighbour {
     rest: Option<Rest>,
     /// It had no room on its link: not asked before, and the pause that this was.
     later: Option<(Instant, Duration)>,
+    /// Questions in a row that brought nothing.
+    in_vain: u32,
+    /// When it was last asked, or came into reach.
+    attended: Instant,
+    /// How long after that it is asked in any case.
+    check_after: Duration,
 }
 
 /// A question under way.
 #[derive(Clone, Copy, Debug)]
-struct Question {
+pub(super) struct Question {
     at: Instant,
     named: bool,
     stake: Stake,
@@ -91,8 +105,9 @@ struct Rest {
     pause: Duration,
 }
 
-impl Default for Neighbour {
-    fn default() -> Self {
+impl Neighbour {
+    /// One that came into reach now.
+    pub fn new(now: Instant) -> Self {
         Self {
             announced: None,
             ahead: Ahead::new(),
@@ -107,11 +122,32 @@ impl Default for Neighbour {
             given_up: 0,
             rest: None,
             later: None,
+            in_vain: 0,
+            attended: now,
+            check_after: CHECK_AFTER,
         }
     }
-}
 
-impl Neighbour {
+    /// When it is asked in any case.
+    pub fn check_due(&self) -> Instant {
+        self.attended.after(self.check_after)
+    }
+
+    /// Something is new here: checks may bring something again.
+    pub fn check_sooner(&mut self) {
+        self.check_after = CHECK_AFTER;
+    }
+
+    /// How much its claims are to be doubted: of two neighbours that promise something the one with less comes first.
+    /// 0 for whoever has not asked for patience too often.
+    pub fn doubt(&self) -> u32 {
+        self.in_vain.saturating_sub(VAIN_FREE - 1)
+    }
+
+    fn brought(&mut self, new: usize) {
+        self.in_vain = if new > 0 { 0 } else { self.in_vain.saturating_add(1) };
+    }
+
     /// Whether we never compared all that we hold.
     pub fn is_stranger(&self) -> bool {
         self.compared == 0
@@ -122,13 +158,27 @@ impl Neighbour {
     }
 
     /// Until when a question under way keeps others back; `None` if there is none, or it is overdue.
-    pub fn patience_ends(&self, now: Instant, longest: Duration) -> Option<Instant> {
-        let usual = (self.round_trip + 4 * self.varies).max(PATIENCE_MIN);
-        let backoff = 1 << self.given_up.saturating_sub(GIVEN_UP_FREE).min(GIVEN_UP_MAX);
+    pub fn keeps_others_until(&self, now: Instant, longest: Duration) -> Option<Instant> {
+        if self.doubt() == 0 {
+            return self.patience_ends(now, longest);
+        }
         let question = self.asked?;
-        let worth = PATIENCE_MIN + PATIENCE_PER_FACT.mul_f64(question.stake.gain.min(1e6));
-        let patience = usual.min(worth).saturating_mul(backoff).min(longest.max(PATIENCE_MIN));
+        Some(question.at.after(self.patience(&question, longest))).filter(|ends| now < *ends)
+    }
+
+    /// Until when a question under way is not asked again; `None` if there is none, or it is overdue.
+    pub fn patience_ends(&self, now: Instant, longest: Duration) -> Option<Instant> {
+        let question = self.asked?;
+        let backoff = 1 << self.given_up.saturating_sub(GIVEN_UP_FREE).min(GIVEN_UP_MAX);
+        let patience = self.patience(&question, longest).saturating_mul(backoff).min(longest.max(PATIENCE_MIN));
         Some(question.at.after(patience)).filter(|ends| now < *ends)
+    }
+
+    /// How long an answer may take that is not lost.
+    fn patience(&self, question: &Question, longest: Duration) -> Duration {
+        let usual = (self.round_trip + 4 * self.varies).max(PATIENCE_MIN);
+        let worth = PATIENCE_MIN + PATIENCE_PER_FACT.mul_f64(question.stake.gain.min(1e6));
+        usual.min(worth).min(longest.max(PATIENCE_MIN))
     }
 
     /// Called when no question keeps others back: what was at stake with one that is overdue, once.
@@ -191,12 +241,23 @@ impl Neighbour {
         Ok((have.count.saturating_sub(self.compared) as f64 * NEW_TO_US).max(1.0))
     }
 
+    /// The vector to ask it with, to see whether it has anything: of all logs, without hashes, which cost four times as
+    /// much and show forks alone.
+    pub fn check(&mut self, now: Instant, me: RobotId, replica: &Replica, stake: Stake) -> HaveVector {
+        let tagged = core::mem::replace(&mut self.tagged, false);
+        let have = self.question(now, me, replica, stake);
+        self.tagged = tagged;
+        have
+    }
+
     /// The vector to ask it with: of the logs it is known to have more of, else of all.
     pub fn question(&mut self, now: Instant, me: RobotId, replica: &Replica, stake: Stake) -> HaveVector {
         let named = self.named(replica);
         if self.asked.is_some() {
             self.given_up = self.given_up.saturating_add(1);
+            self.brought(0);
         }
+        self.attended = now;
         self.asked = Some(Question { at: now, named: !named.is_empty(), stake, lost: false, window: self.window });
         if !named.is_empty() {
             return replica.have_named(me, self.listed, named);
@@ -212,12 +273,20 @@ impl Neighbour {
         if answer != Answer::Failed {
             self.given_up = 0;
         }
+        if let Answer::Got { new: 1.., .. } = answer {
+            self.brought(1);
+            self.check_sooner();
+        }
         let Some(question) = self.asked.take_if(|question| question.at == asked) else {
             if matches!(answer, Answer::Got { .. }) {
                 self.took(now.since(asked)); // Given up too early: have more patience.
             }
             return;
         };
+        if !matches!(answer, Answer::Got { new: 1.., .. } | Answer::Postponed) {
+            self.brought(0);
+            self.check_after = (2 * self.check_after).min(CHECK_AFTER_MAX);
+        }
         let (new, more) = match answer {
             Answer::Failed => {
                 self.more = false; // Somebody else may do better. How long answers take, those that come tell.
@@ -291,7 +360,7 @@ mod tests {
     #[test]
     fn patience_follows_the_answers_late_ones_too() {
         let (replica, me) = (replica(), samples::robot(0));
-        let mut one = Neighbour::default();
+        let mut one = Neighbour::new(Instant::ZERO);
         let longest = Duration::from_secs(10);
         let patience = |one: &mut Neighbour, now: Instant, gain: f64| {
             one.question(now, me, &replica, usual(gain));
@@ -321,7 +390,7 @@ mod tests {
     fn who_never_answers_is_asked_ever_more_rarely() {
         let (replica, me) = (replica(), samples::robot(0));
         let ours = (replica.root(), replica.count());
-        let mut one = Neighbour::default();
+        let mut one = Neighbour::new(Instant::ZERO);
         one.heard(Instant::ZERO, HaveRoot { root: [1; 8], count: 5_000 });
         let longest = Duration::from_secs(6);
         let mut now = Instant::ZERO;
@@ -347,7 +416,7 @@ mod tests {
     fn who_has_no_room_is_asked_the_same_again_after_a_pause() {
         let (replica, me) = (replica(), samples::robot(0));
         let ours = (replica.root(), replica.count());
-        let mut one = Neighbour::default();
+        let mut one = Neighbour::new(Instant::ZERO);
         one.heard(Instant::ZERO, HaveRoot { root: [1; 8], count: 50 });
         one.question(Instant::ZERO, me, &replica, usual(1.0));
         one.answered(Instant::ZERO, ours.0, Instant::ZERO, Answer::Got { new: 5, more: true });

@@ -106,6 +106,21 @@ pub enum IngestError {
 }
 
 impl IngestError {
+    /// The robot whose signature stands under what was refused. Nobody is blamed for bytes that anyone may have sent.
+    pub fn culprit(&self) -> Option<RobotId> {
+        match self {
+            Self::FloorMoved(id) | Self::TooEarly(id) => Some(id.frame.robot),
+            Self::Fork(frame) => Some(frame.robot),
+            Self::Entry(_)
+            | Self::Swarm(_)
+            | Self::UnknownOrigin(_)
+            | Self::EpochLimit(_)
+            | Self::SeqLimit(_)
+            | Self::Quarantined(_)
+            | Self::NotAProof => None,
+        }
+    }
+
     /// A short name for counters.
     pub fn reason(&self) -> &'static str {
         match self {

@@ -35,11 +35,13 @@ pub enum FrameKind {
     AlignRequest = 8,
     /// What became of it.
     AlignReply = 9,
+    /// A piece of a blob that proves itself.
+    BlobSlice = 10,
 }
 
 impl FrameKind {
     /// Every kind, in order of its number.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Pose,
         Self::Facts,
         Self::Have,
@@ -49,6 +51,7 @@ impl FrameKind {
         Self::BlobReply,
         Self::AlignRequest,
         Self::AlignReply,
+        Self::BlobSlice,
     ];
 
     fn of(number: u8) -> Option<Self> {
@@ -61,7 +64,7 @@ impl FrameKind {
             Self::Pose => BEACON_LEN_MAX,
             Self::Have => HAVE_LEN_MAX,
             Self::BlobRequest | Self::AlignRequest | Self::AlignReply => SMALL_LEN_MAX,
-            Self::Facts | Self::SyncRequest | Self::SyncReply | Self::BlobReply => {
+            Self::Facts | Self::SyncRequest | Self::SyncReply | Self::BlobReply | Self::BlobSlice => {
                 MESSAGE_LEN_MAX + MESSAGE_OVERHEAD_MAX
             }
         }

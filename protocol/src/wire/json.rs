@@ -26,6 +26,10 @@ pub(super) fn length<S: Serializer>(bytes: &[u8], s: S) -> Result<S::Ok, S::Erro
     s.serialize_u64(bytes.len() as u64)
 }
 
+pub(super) fn count<S: Serializer>(values: &[[u8; 32]], s: S) -> Result<S::Ok, S::Error> {
+    s.serialize_u64(values.len() as u64)
+}
+
 pub(super) fn beacon<S: Serializer>(beacon: &Beacon, s: S) -> Result<S::Ok, S::Error> {
     json!({
         "robot": beacon.robot().to_string(),

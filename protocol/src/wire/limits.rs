@@ -30,6 +30,8 @@ pub const SUMMARY_LEN_MAX: usize = 400;
 pub const BLOB_LEN_MAX: usize = 64 * 1024;
 /// Piece of a blob that keeps poses flowing on a slow link, if asked for every 100 ms.
 pub const BLOB_PIECE_LEN: usize = 16 * 1024;
+/// Values that prove a piece of a blob at most: of each halving of [`BLOB_LEN_MAX`] down to BLAKE3's chunks of 1 KiB two.
+pub const PROOF_MAX: usize = 10;
 /// Entries in one message at most.
 pub const ENTRIES_PER_DELTA_MAX: usize = 1024;
 /// Heads in one have-vector at most; a longer vector is sent in windows.

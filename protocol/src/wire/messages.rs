@@ -6,7 +6,9 @@ use super::beacon::{Beacon, RawBeacon};
 use super::entry::EntryBytes;
 use super::frame::{self, FrameKind, WireError};
 use super::have::{HaveRoot, HaveVector, RawHaveVector};
-use super::limits::{self, BLOB_LEN_MAX, ENTRIES_PER_DELTA_MAX, ENTRY_LEN_MAX, FORKS_PER_DELTA_MAX, MESSAGE_LEN_MAX};
+use super::limits::{
+    self, BLOB_LEN_MAX, ENTRIES_PER_DELTA_MAX, ENTRY_LEN_MAX, FORKS_PER_DELTA_MAX, MESSAGE_LEN_MAX, PROOF_MAX,
+};
 use crate::ids::{Hash, SubmapId};
 use serde::{Deserialize, Serialize};
 
@@ -47,6 +49,10 @@ pub enum Message {
         /// The piece.
         #[serde(serialize_with = "super::json::length")]
         bytes: Vec<u8>,
+        /// What [proves](super::slice) that the piece belongs there; nothing if it is the whole, or empty. With a proof the
+        /// frame is of another kind.
+        #[serde(serialize_with = "super::json::count", skip_serializing_if = "Vec::is_empty")]
+        proof: Vec<[u8; 32]>,
     },
     /// "I think these two submaps overlap; please look."
     AlignRequest {
@@ -112,6 +118,13 @@ struct RawBlobReply {
     bytes: Vec<u8>,
 }
 
+#[derive(Serialize, Deserialize)]
+struct RawBlobSlice {
+    piece: RawBlobReply,
+    #[serde(deserialize_with = "limits::list::<_, _, PROOF_MAX>")]
+    proof: Vec<[u8; 32]>,
+}
+
 impl Message {
     /// The framed bytes. A message over its limits encodes too, and is refused by every receiver;
     /// [`Message::facts`] and the replica's deltas stay within them.
@@ -126,8 +139,12 @@ impl Message {
             Self::BlobRequest { hash, offset, len } => {
                 frame::seal(kind, &RawBlobRequest { hash: *hash, offset: *offset, len: *len })
             }
-            Self::BlobReply { hash, offset, total, bytes } => {
-                frame::seal(kind, &RawBlobReply { hash: *hash, offset: *offset, total: *total, bytes: bytes.clone() })
+            Self::BlobReply { hash, offset, total, bytes, proof } => {
+                let piece = RawBlobReply { hash: *hash, offset: *offset, total: *total, bytes: bytes.clone() };
+                match kind {
+                    FrameKind::BlobReply => frame::seal(kind, &piece),
+                    _ => frame::seal(kind, &RawBlobSlice { piece, proof: proof.clone() }),
+                }
             }
             Self::AlignRequest { i, j } => frame::seal(kind, &(i, j)),
             Self::AlignReply { status } => frame::seal(kind, status),
@@ -164,12 +181,16 @@ impl Message {
                 require(len > 0, "len", "must be at least 1")?;
                 Self::BlobRequest { hash, offset, len }
             }
-            FrameKind::BlobReply => {
-                let RawBlobReply { hash, offset, total, bytes } = frame::parse_body(kind, body)?;
+            FrameKind::BlobReply | FrameKind::BlobSlice => {
+                let RawBlobSlice { piece, proof } = match kind {
+                    FrameKind::BlobReply => RawBlobSlice { piece: frame::parse_body(kind, body)?, proof: Vec::new() },
+                    _ => frame::parse_body(kind, body)?,
+                };
+                let RawBlobReply { hash, offset, total, bytes } = piece;
                 require(total as usize <= BLOB_LEN_MAX, "total", "must be at most 65536")?;
                 let end = u64::from(offset) + bytes.len() as u64;
                 require(end <= u64::from(total), "bytes", "must lie inside the blob")?;
-                Self::BlobReply { hash, offset, total, bytes }
+                Self::BlobReply { hash, offset, total, bytes, proof }
             }
             FrameKind::AlignRequest => {
                 let (i, j) = frame::parse_body(kind, body)?;
@@ -220,7 +241,8 @@ impl Message {
             Self::SyncRequest(_) => FrameKind::SyncRequest,
             Self::SyncReply(_) => FrameKind::SyncReply,
             Self::BlobRequest { .. } => FrameKind::BlobRequest,
-            Self::BlobReply { .. } => FrameKind::BlobReply,
+            Self::BlobReply { proof, .. } if proof.is_empty() => FrameKind::BlobReply,
+            Self::BlobReply { .. } => FrameKind::BlobSlice,
             Self::AlignRequest { .. } => FrameKind::AlignRequest,
             Self::AlignReply { .. } => FrameKind::AlignReply,
         }

@@ -18,6 +18,7 @@ pub mod payload;
 pub mod pose;
 #[cfg(test)]
 pub(crate) mod samples;
+pub mod slice;
 #[cfg(test)]
 mod tests;
 

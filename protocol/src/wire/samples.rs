@@ -167,7 +167,12 @@ samples! {
             "blob_request" => Message::BlobRequest { hash: Hash::of(b"blob"), offset: 16_384, len: 16_384 }
         }
         Message::BlobReply { .. } => {
-            "blob_reply" => Message::BlobReply { hash: Hash::of(b"blob"), offset: 3, total: 9, bytes: vec![1, 2, 3] }
+            "blob_reply" => Message::BlobReply {
+                hash: Hash::of(b"blob"), offset: 3, total: 9, bytes: vec![1, 2, 3], proof: vec![]
+            },
+            "blob_slice" => Message::BlobReply {
+                hash: Hash::of(b"blob"), offset: 1024, total: 2049, bytes: vec![9; 1024], proof: vec![[5; 32], [6; 32]]
+            }
         }
         Message::AlignRequest { .. } => {
             "align_request" => Message::AlignRequest { i: submap(0, 7), j: submap(1, 4) }

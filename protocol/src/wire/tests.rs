@@ -92,6 +92,7 @@ fn claims_of_a_gigabyte_are_refused() {
         (FrameKind::SyncReply, vec![&[0], &huge]),
         (FrameKind::SyncReply, vec![&[0, 1], &huge]),
         (FrameKind::BlobReply, vec![&hash, &[0, 0], &huge]),
+        (FrameKind::BlobSlice, vec![&hash, &[0, 0, 0], &huge]),
     ] {
         let error = Message::decode(&framed(kind, &parts)).unwrap_err();
         assert_eq!(error.reason(), "malformed", "{kind:?}: {error}");
@@ -133,8 +134,16 @@ fn every_kind_has_a_limit_that_is_checked_on_both_sides() {
         assert_eq!(error(len + 1), WireError::TooLong { kind, len: len + 1, max: len });
     }
     let blob = |len: usize, total: u32| {
-        Message::decode(&Message::BlobReply { hash: Hash::default(), offset: 0, total, bytes: vec![7; len] }.encode())
+        let (hash, bytes) = (Hash::default(), vec![7; len]);
+        Message::decode(&Message::BlobReply { hash, offset: 0, total, bytes, proof: vec![] }.encode())
     };
+    let proved = |values: usize| {
+        let proof = vec![[7; 32]; values];
+        Message::decode(
+            &Message::BlobReply { hash: Hash::default(), offset: 0, total: 9, bytes: vec![], proof }.encode(),
+        )
+    };
+    assert!(proved(PROOF_MAX).is_ok() && proved(PROOF_MAX + 1).is_err());
     assert!(blob(BLOB_LEN_MAX, BLOB_LEN_MAX as u32).is_ok());
     assert!(blob(BLOB_LEN_MAX + 1, BLOB_LEN_MAX as u32 + 1).is_err());
     assert!(blob(0, BLOB_LEN_MAX as u32 + 1).is_err());

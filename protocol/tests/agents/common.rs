@@ -130,6 +130,8 @@ fn gaussian(rng: &mut ChaCha8Rng) -> f64 {
     (0..12).map(|_| rng.random_range(0.0..1.0)).sum::<f64>() - 6.0
 }
 
+/// What an outsider answers to a question of this robot's.
+type Forged = Box<dyn Fn(usize, QueryKind, &[u8]) -> Vec<Vec<u8>>>;
 /// Whether an answer never comes: to whom, and which.
 type Lost = Box<dyn Fn(usize, &[u8]) -> bool>;
 
@@ -150,6 +152,8 @@ pub struct Wires {
     pub answers: Answers,
     /// Which answers are lost.
     pub lost: Lost,
+    /// What an outsider answers before the one who is asked does.
+    pub forged: Forged,
     inbox: VecDeque<(usize, Input)>,
 }
 
@@ -166,6 +170,7 @@ impl Wires {
             pieces: Vec::new(),
             answers: Box::new(|_| None),
             lost: Box::new(|_, _| false),
+            forged: Box::new(|_, _, _| Vec::new()),
             inbox: VecDeque::new(),
         };
         for a in 0..wires.agents.len() {
@@ -226,7 +231,8 @@ impl Wires {
                 }
                 self.published.push((k, channel, bytes));
             }
-            Output::Ask { query, peer, kind, bytes } => {
+            Output::Ask { query, peer, kind, bytes: question } => {
+                let bytes = question.clone();
                 let token = merganser_protocol::agent::io::AskToken(query.0);
                 let answer = self.agents.iter().position(|agent| agent.robot() == peer).map(|other| {
                     self.agents[other].handle(self.now, Input::Asked { token, kind, bytes });
@@ -243,7 +249,10 @@ impl Wires {
                 if kind == QueryKind::Blob {
                     self.pieces.push((k, self.now, answer.clone()));
                 }
-                self.inbox.push_back((k, Input::Answered { query, bytes: answer }));
+                let forged = (self.forged)(k, kind, &question);
+                for bytes in forged.into_iter().chain(answer).map(Some).chain([None]) {
+                    self.inbox.push_back((k, Input::Answered { query, bytes }));
+                }
             }
             Output::Answer { .. } => {}
             Output::Run { id, job } => {

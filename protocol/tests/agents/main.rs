@@ -16,6 +16,7 @@ mod epochs;
 mod front_ends;
 mod link_budget;
 mod lookalikes;
+mod outsiders;
 mod restarts;
 mod second_looks;
 mod sightings;

@@ -13,6 +13,7 @@ use merganser_protocol::wire::fact::{
     SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
 };
 use merganser_protocol::wire::limits::{BLOB_PIECE_LEN, PAYLOAD_LEN_MAX};
+use merganser_protocol::wire::slice;
 use merganser_protocol::wire::{
     AlignStatus, Beacon, BeaconContent, Delta, Entry, EntryBytes, EntryContent, HaveRoot, HaveVector, Head, Members,
     Message, SwarmTag,
@@ -214,16 +215,13 @@ impl Forge {
                 let blob = &described().0;
                 let start = (offset as usize).min(blob.len());
                 let end = start.saturating_add((len as usize).min(BLOB_PIECE_LEN)).min(blob.len());
-                match r.below(4) {
-                    0 => Message::BlobReply { hash, offset, total: 0, bytes: Vec::new() },
-                    1 => {
-                        let bytes = vec![7; BLOB_PIECE_LEN];
-                        Message::BlobReply { hash, offset, total: 65_536 - u32::from(r.byte()), bytes }
-                    }
-                    _ => {
-                        Message::BlobReply { hash, offset, total: blob.len() as u32, bytes: blob[start..end].to_vec() }
-                    }
-                }
+                let (total, bytes) = match r.below(4) {
+                    0 => (0, Vec::new()),
+                    1 => (65_536 - u32::from(r.byte()), vec![7; BLOB_PIECE_LEN]),
+                    _ => (blob.len() as u32, blob[start..end].to_vec()),
+                };
+                let proof = if r.one_in(4) { vec![[7; 32]; r.below(4)] } else { slice::proof(blob, start..end) };
+                Message::BlobReply { hash, offset, total, bytes, proof }
             }
             _ => Message::AlignReply { status: r.pick(&[AlignStatus::Accepted, AlignStatus::Busy, AlignStatus::Done]) },
         };

@@ -190,23 +190,32 @@ impl<'m, M: Meter> Story<'m, M> {
         }
     }
 
-    /// A question of the agent's is carried to whom it asks; the answer comes whole, damaged, late or never.
+    /// A question of the agent's is carried to whom it asks; the answer comes whole, damaged, late or never, alone or
+    /// behind a forged one.
     fn answer_question(&mut self, k: usize, r: &mut Reader) {
         let count = self.shells[k].asked.len();
         let Some(place) = (count > 0).then(|| r.below(256) % count) else { return };
         let Asked { query, peer, kind, bytes } = self.shells[k].asked.swap_remove(place);
         let other = 1 - k;
-        let bytes = if peer == robot(other) {
-            let question = r.mangled(bytes);
+        let answer = if peer == robot(other) {
+            let question = r.mangled(bytes.clone());
             let answer = self.put_question(other, kind, question);
             Some(r.mangled(answer))
         } else {
             Some(self.forge.answer(r, kind, &bytes))
         };
-        let bytes = bytes.filter(|_| !r.one_in(16));
+        let question = bytes;
+        let bytes = answer.filter(|_| !r.one_in(16));
+        if r.one_in(4) {
+            let forged = self.forge.answer(r, kind, &question);
+            self.give(k, Input::Answered { query, bytes: Some(forged) });
+        }
         self.give(k, Input::Answered { query, bytes: bytes.clone() });
         if r.one_in(8) {
             self.give(k, Input::Answered { query, bytes });
+        }
+        if !r.one_in(16) {
+            self.give(k, Input::Answered { query, bytes: None });
         }
     }
 
@@ -378,8 +387,11 @@ impl<'m, M: Meter> Story<'m, M> {
                     self.give(k, Input::JobDone { job, result: work.run() });
                 }
                 for Asked { query, peer, kind, bytes } in core::mem::take(&mut self.shells[k].asked) {
-                    let bytes = (peer == robot(1 - k)).then(|| self.put_question(1 - k, kind, bytes));
-                    self.give(k, Input::Answered { query, bytes });
+                    if peer == robot(1 - k) {
+                        let bytes = Some(self.put_question(1 - k, kind, bytes));
+                        self.give(k, Input::Answered { query, bytes });
+                    }
+                    self.give(k, Input::Answered { query, bytes: None });
                 }
                 let old = self.air.len().saturating_sub(FRESH);
                 let fresh: Vec<_> = self.air.iter().skip(old).cloned().collect();

@@ -85,7 +85,10 @@ impl<C: Restartable> Swarm<C> {
                 // The first answer or the deadline counts; what comes after is late.
                 if robot.incarnation == incarnation && robot.questions.remove(&query) {
                     self.counts.unanswered += u64::from(bytes.is_none());
-                    self.feed(now, to, Input::Answered { query, bytes });
+                    if bytes.is_some() {
+                        self.feed(now, to, Input::Answered { query, bytes });
+                    }
+                    self.feed(now, to, Input::Answered { query, bytes: None });
                 }
             }
             Event::Commit { robot, incarnation } if self.runs(robot, incarnation) => self.commit(now, robot),

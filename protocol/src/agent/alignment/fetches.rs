@@ -2,10 +2,8 @@
 
 use crate::agent::io::QueryId;
 use crate::agent::replication::Lacking;
-use crate::gossip::PIECE_BYTES_MIN;
 use crate::ids::{Hash, RobotId};
 use crate::time::Instant;
-use crate::wire::limits::BLOB_PIECE_LEN;
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -100,8 +98,8 @@ impl Fetches {
         }
     }
 
-    /// A piece of a blob came. Pieces may come from different robots; the hash of the whole decides. The next is not
-    /// asked for before `next_piece`. All bytes, if it was the last.
+    /// A piece of a blob came that is as its address says, or an empty one: it is put off. Pieces may come from different
+    /// robots. The next is not asked for before `next_piece`. All bytes, if it was the last.
     pub(super) fn on_piece(
         &mut self,
         query: QueryId,
@@ -116,7 +114,7 @@ impl Fetches {
         if goes_on && piece.is_empty() {
             return self.put_off_by_holder(query, hash, now);
         }
-        if !goes_on || !is_piece(piece.len(), left) {
+        if !goes_on {
             return self.failed(query, now);
         }
         fetch.got.extend_from_slice(piece);
@@ -202,11 +200,6 @@ pub(super) enum Piece {
     GivenUp,
 }
 
-/// Whether a piece has a length that an honest holder would send, of a blob of which so much is lacking.
-fn is_piece(len: usize, lacking: usize) -> bool {
-    (lacking.min(PIECE_BYTES_MIN)..=lacking.min(BLOB_PIECE_LEN)).contains(&len)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -266,16 +259,5 @@ mod tests {
         fetches.postponed.remove(&hash);
         fetches.put_off_by_holder(query, hash, Instant::ZERO);
         assert_eq!(fetches.wanted[&hash].not_before.since(Instant::ZERO).as_millis(), 500);
-    }
-
-    #[test]
-    fn a_piece_is_neither_too_short_nor_too_long() {
-        let lengths = |lacking| {
-            [PIECE_BYTES_MIN - 1, PIECE_BYTES_MIN, 5_000, BLOB_PIECE_LEN, BLOB_PIECE_LEN + 1]
-                .map(|len| is_piece(len, lacking))
-        };
-        assert_eq!(lengths(40_000), [false, true, true, true, false]);
-        assert_eq!(lengths(5_000), [false, true, true, false, false]);
-        assert_eq!(lengths(PIECE_BYTES_MIN - 1), [true, false, false, false, false], "the last may be short");
     }
 }

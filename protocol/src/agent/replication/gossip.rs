@@ -14,6 +14,7 @@ use crate::ids::{Hash, RobotId, SubmapId};
 use crate::time::{Instant, Stamp};
 use crate::wire::limits::BLOB_PIECE_LEN;
 use crate::wire::messages::Message;
+use crate::wire::slice;
 use crate::wire::{Beacon, BeaconContent, Delta, EntryBytes};
 use core::time::Duration;
 use std::collections::BTreeMap;
@@ -41,29 +42,37 @@ pub(super) struct Gossip {
 }
 
 /// A question of ours under way.
+///
+/// Nobody signs answers, and anyone may give one in another's name. So each is judged by what it proves: entries by
+/// their signatures, pieces of a blob by its address. One that proves nothing settles nothing, for another may follow;
+/// what it claims counts only when it is known that none will.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::agent) struct Question {
     pub(in crate::agent) peer: RobotId,
     about: About,
     asked: Instant,
     expires: Instant,
+    /// The best of the answers that proved nothing.
+    unproved: Answer,
+    /// What came of it was reported: further answers are taken in, and change nothing about that.
+    is_settled: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum About {
     Sync,
-    Blob(Hash),
+    /// The piece of this blob that begins there.
+    Blob(Hash, usize),
     Align,
 }
 
 /// What came of a question of ours, as far as it concerns others.
 pub(in crate::agent) enum Reply {
     Nothing,
-    /// Entries and proofs that are to be taken in.
-    Delta(Question, Delta),
-    /// A piece of a blob.
+    /// Entries and proofs that are to be taken in; this robot was asked.
+    Delta(RobotId, Delta),
+    /// A piece of a blob that is as it should be, or, if it is empty, is put off.
     Piece {
-        peer: RobotId,
         hash: Hash,
         offset: u32,
         total: u32,
@@ -202,7 +211,8 @@ impl Replication {
         let bytes = self.pay_for(context, message);
         let asked = context.now();
         let expires = asked.after(Duration::from_secs_f64(3.0 * context.config().gossip.answer_secs));
-        self.gossip.questions.insert(query, Question { peer, about, asked, expires });
+        let question = Question { peer, about, asked, expires, unproved: Answer::Failed, is_settled: false };
+        self.gossip.questions.insert(query, question);
         context.put(Output::Ask { query, peer, kind, bytes });
         query
     }
@@ -226,7 +236,7 @@ impl Replication {
         let message = match Message::decode(bytes) {
             Ok(message) => message,
             Err(error) => {
-                context.reject(Some(from), error.reason(), &error.to_string());
+                context.reject_unsigned(from, error.reason(), &error.to_string());
                 return Vec::new();
             }
         };
@@ -236,24 +246,24 @@ impl Replication {
             (Channel::Facts, Message::Facts(_)) if self.is_overloaded() => {
                 // Nothing is lost: it comes again when the sets are compared.
                 let detail = format!("{BATCHES_WAITING_MAX} batches wait for the disk");
-                context.reject(Some(from), "facts: overload", &detail);
+                context.reject_unsigned(from, "facts: overload", &detail);
             }
             (Channel::Facts, Message::Facts(entries)) => return entries,
             (Channel::Have, Message::Have(_)) if context.name_of(from).is_none() => {
                 let detail = "the key names a robot that is not in the roster";
-                context.reject(Some(from), "have: unknown robot", detail);
+                context.reject_unsigned(from, "have: unknown robot", detail);
             }
             (Channel::Have, Message::Have(have)) => {
                 self.gossip.spread.on_have(context.now(), &self.replica, from, have);
             }
-            (_, other) => context.reject(Some(from), "wrong channel", other.kind()),
+            (_, other) => context.reject_unsigned(from, "wrong channel", other.kind()),
         }
         Vec::new()
     }
 
     fn on_beacon(&mut self, context: &mut Context, from: RobotId, beacon: &Beacon) {
         if !self.replica.verify_beacon(beacon) {
-            return context.reject(Some(from), "pose: signature", "beacon not signed by the robot it names");
+            return context.reject_unsigned(from, "pose: signature", "the beacon's own signature does not hold");
         }
         if beacon.robot() != context.robot() {
             self.beacons.hear(**beacon, context.now());
@@ -281,7 +291,7 @@ impl Replication {
         self.gossip.next_piece = context.now().after(Duration::from_secs_f64(pause));
         let Lacking { hash, offset, .. } = *piece;
         let request = Message::BlobRequest { hash, offset: offset as u32, len: BLOB_PIECE_LEN as u32 };
-        Ok(self.ask(context, peer, QueryKind::Blob, &request, About::Blob(hash)))
+        Ok(self.ask(context, peer, QueryKind::Blob, &request, About::Blob(hash, offset)))
     }
 
     /// The earliest time for another piece of the same blob.
@@ -306,51 +316,113 @@ impl Replication {
         }
     }
 
-    /// A question of ours was answered, or never will be.
+    /// A question of ours has an answer, or, if there are no `bytes`, will have no more.
     pub(in crate::agent) fn on_answered(
         &mut self,
         context: &mut Context,
         query: QueryId,
         bytes: Option<&[u8]>,
     ) -> Reply {
-        let Some(question) = self.gossip.questions.remove(&query) else { return Reply::Nothing };
-        let peer = question.peer;
-        let refused = bytes.is_some_and(<[u8]>::is_empty);
-        let answer = match bytes.filter(|bytes| !bytes.is_empty()).map(Message::decode) {
-            None => None,
-            Some(Ok(message)) => Some(message),
-            Some(Err(error)) => {
-                context.reject(Some(peer), error.reason(), &error.to_string());
-                None
+        let Some(&question) = self.gossip.questions.get(&query) else { return Reply::Nothing };
+        let Some(bytes) = bytes else { return self.on_last_answer(context, query) };
+        if bytes.is_empty() {
+            self.note(query, Answer::Refused);
+            return Reply::Nothing;
+        }
+        let answer = match Message::decode(bytes) {
+            Ok(answer) => answer,
+            Err(error) => {
+                context.reject_unsigned(question.peer, error.reason(), &error.to_string());
+                return Reply::Nothing;
             }
         };
-        if let (Some(message), Some(bytes)) = (&answer, bytes) {
-            context.count().received(message.kind(), bytes.len());
-        }
+        context.count().received(answer.kind(), bytes.len());
         match (question.about, answer) {
-            (About::Sync, Some(Message::SyncReply(delta))) => Reply::Delta(question, delta),
-            (About::Sync, _) => {
-                self.synced(context, &question, if refused { Answer::Refused } else { Answer::Failed });
+            (About::Sync, Message::SyncReply(delta)) => Reply::Delta(question.peer, delta),
+            (About::Blob(hash, offset), Message::BlobReply { hash: named, offset: at, total, bytes, proof })
+                if named == hash && at as usize == offset =>
+            {
+                self.on_piece(context, query, (hash, at, total), bytes, &proof)
+            }
+            (About::Align, Message::AlignReply { .. }) => Reply::Nothing,
+            (_, other) => {
+                context.reject_unsigned(question.peer, "wrong answer", other.kind());
                 Reply::Nothing
             }
-            (About::Blob(hash), Some(Message::BlobReply { hash: named, offset, total, bytes })) if named == hash => {
-                Reply::Piece { peer, hash, offset, total, bytes }
+        }
+    }
+
+    fn on_piece(
+        &mut self,
+        context: &mut Context,
+        query: QueryId,
+        (hash, offset, total): (Hash, u32, u32),
+        bytes: Vec<u8>,
+        proof: &[[u8; 32]],
+    ) -> Reply {
+        if bytes.is_empty() {
+            self.note(query, if total == 0 { Answer::Refused } else { Answer::Postponed });
+            return Reply::Nothing;
+        }
+        if !slice::proves(hash, total as usize, offset as usize, &bytes, proof) {
+            if let Some(question) = self.gossip.questions.get(&query) {
+                let detail = "the bytes are not those that the address names";
+                context.reject_unsigned(question.peer, "blob: wrong bytes", detail);
             }
-            (About::Blob(_), _) => Reply::NoPiece,
+            return Reply::Nothing;
+        }
+        self.gossip.questions.remove(&query);
+        Reply::Piece { hash, offset, total, bytes }
+    }
+
+    /// There will be no more answers: what those said that proved nothing is all there is.
+    fn on_last_answer(&mut self, context: &Context, query: QueryId) -> Reply {
+        let Some(question) = self.gossip.questions.remove(&query) else { return Reply::Nothing };
+        match (question.about, question.unproved) {
+            (About::Sync, answer) => {
+                self.synced(context, &question, answer);
+                Reply::Nothing
+            }
+            (About::Blob(hash, offset), Answer::Postponed) => {
+                Reply::Piece { hash, offset: offset as u32, total: u32::MAX, bytes: Vec::new() }
+            }
+            (About::Blob(..), _) => Reply::NoPiece,
             (About::Align, _) => Reply::Nothing,
         }
     }
 
-    /// What a neighbour knew better was taken in: of it so much was new.
-    pub(in crate::agent) fn on_delta(&mut self, context: &Context, question: &Question, delta: &Delta, new: usize) {
-        let nothing = delta.entries.is_empty() && delta.forks.is_empty();
-        let postponed = delta.more && nothing;
-        let answer = if postponed { Answer::Postponed } else { Answer::Got { new, more: delta.more } };
-        self.synced(context, question, answer);
+    /// Notes an answer that proved nothing. One that says that there is something is believed before one that says that
+    /// there is not: both may be false, and to ask once more costs little.
+    fn note(&mut self, query: QueryId, answer: Answer) {
+        let rank = |answer: &Answer| match answer {
+            Answer::Failed => 0,
+            Answer::Refused => 1,
+            Answer::Got { .. } => 2,
+            Answer::Postponed => 3,
+        };
+        let question = self.gossip.questions.get_mut(&query);
+        if let Some(question) = question.filter(|question| rank(&answer) > rank(&question.unproved)) {
+            question.unproved = answer;
+        }
+    }
+
+    /// What was said to be missing here was taken in: of it so much was new.
+    pub(in crate::agent) fn on_delta(&mut self, context: &Context, query: QueryId, delta: &Delta, new: usize) {
+        if new == 0 {
+            let is_empty = delta.entries.is_empty() && delta.forks.is_empty();
+            let postponed = delta.more && is_empty;
+            return self.note(query, if postponed { Answer::Postponed } else { Answer::Got { new, more: delta.more } });
+        }
+        let Some(question) = self.gossip.questions.get_mut(&query) else { return };
+        question.is_settled = true;
+        let question = Question { is_settled: false, ..*question };
+        self.synced(context, &question, Answer::Got { new, more: delta.more });
     }
 
     fn synced(&mut self, context: &Context, question: &Question, answer: Answer) {
-        self.gossip.spread.on_answer(context.now(), &self.replica, question.peer, question.asked, answer);
+        if !question.is_settled {
+            self.gossip.spread.on_answer(context.now(), &self.replica, question.peer, question.asked, answer);
+        }
     }
 
     /// A question of another, if it can be read and is of the kind that it claims to be.

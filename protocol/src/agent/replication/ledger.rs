@@ -57,6 +57,14 @@ pub(in crate::agent) enum Heard {
     Nothing,
 }
 
+/// Blames whoever signed what is refused; `from` is whose name it came in.
+fn refuse(context: &mut Context, from: RobotId, error: &IngestError) {
+    match error.culprit() {
+        Some(culprit) => context.reject(Some(culprit), error.reason(), &error.to_string()),
+        None => context.reject_unsigned(from, error.reason(), &error.to_string()),
+    }
+}
+
 impl Replication {
     /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
     /// here; what was under way waits for the disk with the rest.
@@ -88,7 +96,7 @@ impl Replication {
                 Heard::Forked(frame)
             }
             Err(error) => {
-                context.reject(Some(from), error.reason(), &error.to_string());
+                refuse(context, from, &error);
                 if let IngestError::TooEarly(id) = error { Heard::Early(id.frame) } else { Heard::Nothing }
             }
         }
@@ -119,7 +127,7 @@ impl Replication {
                 return Heard::Forked(frame);
             }
             Ok((_, false)) => {}
-            Err(error) => context.reject(Some(from), error.reason(), &error.to_string()),
+            Err(error) => refuse(context, from, &error),
         }
         Heard::Nothing
     }

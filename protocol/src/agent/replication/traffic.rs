@@ -10,6 +10,7 @@ use crate::replica::Have;
 use crate::time::Instant;
 use crate::wire::Delta;
 use crate::wire::messages::{Message, carried_len};
+use crate::wire::slice::{self, PIECE_STEP};
 use std::collections::VecDeque;
 
 /// New entries of ours that wait for the link; of more the oldest are left to repair.
@@ -136,18 +137,23 @@ impl Replication {
         Delta { more: true, ..Delta::default() }
     }
 
-    /// The part of a blob that was asked for, as much of it as there is room for; an empty one says "not now".
+    /// The part of a blob that was asked for, as much of it as there is room for, in steps that can be proved; an empty
+    /// one says "not now".
     pub(super) fn piece(&self, context: &mut Context, hash: Hash, offset: usize, len: usize) -> Option<Message> {
-        let blob = self.blobs.get(hash)?;
-        let asked = blob.get(offset..offset.saturating_add(len).min(blob.len()))?; // Beyond its end there is nothing.
+        let blob = self.blobs.get(hash).filter(|blob| offset < blob.len())?;
+        let asked = offset..offset.saturating_add(len).min(blob.len());
         let left = self.gossip.traffic.budget.left(context.now(), Class::Blob);
         let fits = left >= PIECE_BYTES_MIN || asked.len() <= left;
-        let bytes = if fits { asked[..asked.len().min(left)].to_vec() } else { Vec::new() };
-        let total = blob.len() as u32;
+        let end = [asked.end, offset.saturating_add(left)].into_iter().min().unwrap_or(offset);
+        let end = if end == blob.len() { end } else { end - end % PIECE_STEP };
+        let piece = offset..if fits { end } else { offset };
         if !fits {
             context.count().held_back(Class::Blob, 1);
+        } else if !slice::is_aligned(blob.len(), &piece) {
+            return None; // What begins or ends between two steps cannot be proved.
         }
-        Some(Message::BlobReply { hash, offset: offset as u32, total, bytes })
+        let (bytes, proof) = (blob[piece.clone()].to_vec(), slice::proof(blob, piece));
+        Some(Message::BlobReply { hash, offset: offset as u32, total: blob.len() as u32, bytes, proof })
     }
 }
 
