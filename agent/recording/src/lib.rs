@@ -32,6 +32,7 @@ mod remark;
 mod scalar;
 mod table;
 mod text;
+mod unmeasured;
 mod write;
 
 pub use drift::Drift;

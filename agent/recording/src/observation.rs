@@ -86,6 +86,7 @@ mod error;
 pub use depth::{CameraPose, Data, DepthEncoding, DepthMessage};
 pub use error::ObservationError;
 
+use crate::unmeasured::marked_unmeasured;
 use merganser_protocol::agent::io::{PositionSighting, Sighting};
 use merganser_protocol::config::UP_SIGMA_RAD;
 use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, So3};
@@ -428,7 +429,7 @@ fn pose(
         return Err(ObservationError::Number("translation"));
     }
     let rotation = So3::from_xyzw(rotation).ok_or(ObservationError::Rotation)?;
-    let covariance = Covariance::new(symmetric(covariance))?;
+    let covariance = Covariance::new(marked_unmeasured(symmetric(covariance)))?;
     Ok(PoseWithCovariance { pose: Se3::new(rotation, Vector3::from(*translation)), covariance })
 }
 

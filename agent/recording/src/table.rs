@@ -2,6 +2,7 @@
 //! promises refuses the recording; nothing is guessed or skipped.
 
 use super::error::{Problem, RecordingError, on};
+use super::unmeasured::marked_unmeasured;
 use crate::manifest::{KEYFRAMES_HEADER, KEYFRAMES_MAX, POSITIONS_HEADER, TRUTH_HEADER, UP_HEADER};
 use crate::observation::{COORDINATE_MAX, PositionMessage};
 use merganser_protocol::agent::io::PositionSighting;
@@ -194,7 +195,7 @@ fn covariance(fields: &[&str]) -> Result<Covariance<6>, Problem> {
         m[(row, column)] = value;
         m[(column, row)] = value;
     }
-    Ok(Covariance::new(m)?)
+    Ok(Covariance::new(marked_unmeasured(m))?)
 }
 
 /// A cloud's path: relative, and inside the folder.

@@ -11,6 +11,7 @@ mod swarm;
 pub mod track;
 pub mod trajectory;
 pub mod views;
+mod warnings;
 mod watch;
 
 #[cfg(test)]
@@ -92,10 +93,13 @@ pub fn run(args: DemoArgs) -> Result<bool> {
     let runtime = runtime()?;
     let played = runtime.block_on(play(&args, &recordings, &tracks, &work));
     runtime.shutdown_timeout(Duration::from_millis(200));
-    let Played { seen, memory, tails } = played?;
+    let Played { seen, memory, tails, warnings } = played?;
     let evaluation = evaluate::evaluate(&tracks, &seen.views, bounds.as_ref());
     let files = write(&recordings, &tracks, &seen, &evaluation, &out)?;
     say(&told(&seen))?;
+    if !warnings.is_empty() {
+        say(&format!("The robots warned:\n{warnings}"))?;
+    }
     say(&report::evaluation(&evaluation, &tracks))?;
     say(&report::costs(&seen.views, &memory))?;
     say(&report::checks(&evaluation.checks))?;
@@ -120,6 +124,8 @@ struct Played {
     memory: Vec<Option<(u64, u64)>>,
     /// The ends of the logs.
     tails: String,
+    /// What the logs warn of.
+    warnings: String,
 }
 
 async fn play(args: &DemoArgs, recordings: &[Recording], tracks: &[Track], work: &Path) -> Result<Played> {
@@ -139,7 +145,8 @@ async fn play(args: &DemoArgs, recordings: &[Recording], tracks: &[Track], work:
     };
     let memory = swarm.agents.iter().map(swarm::Agent::memory).collect();
     let tails = swarm.agents.iter().map(|agent| format!("{}: {}\n", agent.name, agent.log_tail())).collect();
-    Ok(Played { seen, memory, tails })
+    let warnings = warnings::told(swarm.agents.iter().map(|agent| (&agent.name, agent.log_start())));
+    Ok(Played { seen, memory, tails, warnings })
 }
 
 /// The recordings, and how large the errors may be in the built-in ones, which are known. What others can be like, only

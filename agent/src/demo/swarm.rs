@@ -8,10 +8,13 @@ use anyhow::{Context, Result, bail};
 use merganser_protocol::ids::Name;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
+use std::io::Read;
 use std::net::{Ipv4Addr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
+/// Bytes of a log in which warnings are looked for.
+const START_BYTES: u64 = 4 << 20;
 /// Lines of a log shown when something failed.
 const TAIL_LINES: usize = 15;
 /// Log files larger than this are shown from their end only.
@@ -91,6 +94,13 @@ impl Agent {
             Some(line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok()? * 1024)
         };
         Some((value("VmRSS:")?, value("VmHWM:")?))
+    }
+
+    /// The beginning of its log, where what is wrong with its input is told.
+    pub fn log_start(&self) -> String {
+        let mut bytes = Vec::new();
+        let read = File::open(&self.log).and_then(|file| file.take(START_BYTES).read_to_end(&mut bytes));
+        read.map_or_else(|_| String::new(), |_| String::from_utf8_lossy(&bytes).into_owned())
     }
 
     /// The last lines of its log.

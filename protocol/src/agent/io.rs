@@ -2,6 +2,7 @@
 
 use super::job::{Job, JobResult};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
+use crate::submap::stated::Oddity;
 use crate::submap::{Keyframe, Loss};
 use crate::time::Stamp;
 use serde::{Deserialize, Serialize};
@@ -370,6 +371,13 @@ pub enum Event {
         frame: FrameId,
         /// What lost them.
         why: Loss,
+    },
+    /// What our front end states of its own errors is odd. Each kind is told once in an epoch.
+    OdometryOdd {
+        /// Our frame.
+        frame: FrameId,
+        /// In what way.
+        oddity: Oddity,
     },
     /// A new epoch, hence a new frame, began.
     EpochBegan {

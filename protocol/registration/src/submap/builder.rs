@@ -22,6 +22,7 @@ use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
 use super::rest::{NOISE_MAX, Rest, is_blurred, is_near};
 use super::runs::Runs;
+use super::stated::{Oddities, Oddity, is_constant};
 use super::thinning::Thinner;
 use super::{Keyframe, KeyframeError, Mark, PlaceDescriptor, PoseWithCovariance};
 use crate::config::{Gravity, SubmapConfig};
@@ -92,6 +93,7 @@ pub struct SubmapBuilder {
     sharpener: Sharpener,
     misfits: Misfits,
     misfit: Option<f64>,
+    oddities: Oddities,
 }
 
 impl SubmapBuilder {
@@ -114,6 +116,7 @@ impl SubmapBuilder {
             sharpener: Sharpener::default(),
             misfits: Misfits::default(),
             misfit: None,
+            oddities: Oddities::default(),
         }
     }
 
@@ -159,7 +162,7 @@ impl SubmapBuilder {
         }
         let step = self.leave(step);
         let step = self.taken(step, &keyframe);
-        let ended = if step.as_ref().is_some_and(|step| self.would_blur(step)) { self.flush() } else { None };
+        let ended = step.as_ref().filter(|step| self.would_blur(step)).and_then(|step| self.end_before(step));
         let Modality { planar, sharpens, .. } = Modality::of(self.config.sensor);
         self.t_frame_body = match &step {
             Some(step) if sharpens => self.t_frame_body * step.pose,
@@ -173,8 +176,16 @@ impl SubmapBuilder {
         Ok(if self.is_complete() { self.finish().or(ended) } else { ended })
     }
 
+    /// Closes the open submap before a motion that it does not go on to.
+    fn end_before(&mut self, step: &PoseWithCovariance) -> Option<Submap> {
+        let keyframes = self.open.as_ref().map_or(0, |open| open.keyframes.len());
+        self.oddities.ended(keyframes, Some(&step.covariance), &self.config);
+        self.flush()
+    }
+
     /// Closes the open submap, which is complete; a body that did not move in it is at rest from now on.
     fn finish(&mut self) -> Option<Submap> {
+        self.oddities.ended(0, None, &self.config);
         let stands = self.open.as_ref().is_some_and(|open| self.stands(open));
         let closed = self.flush();
         let at = self.last.as_ref().filter(|_| stands).map(|last| last.pose.pose);
@@ -240,6 +251,11 @@ impl SubmapBuilder {
     /// is so much that the intrinsics, the unit, the extrinsics or the odometry must be wrong. Only of depth cameras.
     pub fn take_misfit(&mut self) -> Option<f64> {
         self.misfit.take()
+    }
+
+    /// What is odd about the covariances that the front end states: each kind once.
+    pub fn take_oddities(&mut self) -> Vec<Oddity> {
+        self.oddities.take()
     }
 
     /// A keyframe was lost: whatever came of it, the motion to the next one crosses a gap.
@@ -339,6 +355,7 @@ impl SubmapBuilder {
         let gap = gap.or(last.filter(|last| self.arrivals.lack(last, keyframe)).map(|_| Loss::Unseen));
         self.arrivals.take(last.filter(|_| gap.is_none()), keyframe, &self.config);
         let last = last?;
+        self.oddities.look(last, keyframe, is_constant(last, keyframe, &self.config), &self.config);
         let across = gap.and_then(|why| Some((why, motion_across(last, keyframe, &self.config)?)));
         self.crossed = across.map(|(why, _)| why);
         Some(across.map_or_else(|| motion(last, keyframe, &self.config), |(_, across)| across))

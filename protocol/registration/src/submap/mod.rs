@@ -40,6 +40,7 @@ mod robust;
 pub mod runs;
 mod sampling;
 mod scene;
+pub mod stated;
 pub mod summary;
 mod surface;
 #[doc(hidden)]

@@ -1,6 +1,7 @@
 //! Covariance of the motion between two keyframes: as reported, or derived from the covariances of absolute poses, or
 //! assumed across a gap. Local perturbations throughout (MATH §1).
 
+use super::stated::{Axes, is_constant};
 use super::{CovarianceOf, Keyframe};
 use crate::config::SubmapConfig;
 use crate::geometry::{Covariance, PoseWithCovariance, Se3};
@@ -20,10 +21,16 @@ const GAP_TURN_PER_SUBMAP: f64 = 0.2;
 /// `t_last_next` with the covariance of its local perturbation, if no keyframe between the two was lost.
 pub fn motion(last: &Keyframe, next: &Keyframe, config: &SubmapConfig) -> PoseWithCovariance {
     let pose = last.pose.pose.inverse() * next.pose.pose;
+    let axes = Axes::unmeasured(&next.pose.covariance, config);
     let covariance = match (next.covariance_of, last.covariance_of) {
         (CovarianceOf::Motion, _) => next.pose.covariance,
+        _ if is_constant(last, next, config) => across_gap(&pose, config, &next.pose.covariance).covariance,
         (CovarianceOf::Pose, CovarianceOf::Pose) => derived(last, next, &pose, config).0,
         (CovarianceOf::Pose, CovarianceOf::Motion) => across_gap(&pose, config, &next.pose.covariance).covariance,
+    };
+    let covariance = match axes.is_empty() {
+        true => covariance,
+        false => axes.loosened(&covariance, &across_gap(&pose, config, &covariance).covariance),
     };
     PoseWithCovariance { pose, covariance }
 }
@@ -61,7 +68,13 @@ pub fn isotropic(rho: f64, phi: f64, otherwise: &Covariance<6>) -> Covariance<6>
 /// closure between the two makes it indefinite, so it is raised to a floor in every direction. Whether it had to be.
 fn derived(last: &Keyframe, next: &Keyframe, t_last_next: &Se3, config: &SubmapConfig) -> (Covariance<6>, bool) {
     let ad = t_last_next.inverse().adjoint();
-    let difference = next.pose.covariance.matrix() - ad * last.pose.covariance.matrix() * ad.transpose();
+    let axes = Axes::unmeasured(&next.pose.covariance, config);
+    // What is not measured must not be taken for the error of an axis that is, where the body turns.
+    let [before, after] = [last, next].map(|keyframe| {
+        let stated = &keyframe.pose.covariance;
+        axes.loosened(stated, &isotropic(DERIVED_SIGMA_RAD, DERIVED_SIGMA_RAD, stated))
+    });
+    let difference = after.matrix() - ad * before.matrix() * ad.transpose();
     let rho = DERIVED_SIGMA_PER_M * t_last_next.translation.norm() + DERIVED_SIGMA_VOXELS * config.voxel_m;
     let phi = DERIVED_SIGMA_PER_RAD * t_last_next.rotation.angle() + DERIVED_SIGMA_RAD;
     raised(&difference, &isotropic(rho, phi, &next.pose.covariance))

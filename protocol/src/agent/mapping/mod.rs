@@ -172,6 +172,9 @@ impl Mapping {
         match self.builder.push(keyframe) {
             Ok(closed) => {
                 self.behind = None;
+                for oddity in self.builder.take_oddities() {
+                    context.event(Event::OdometryOdd { frame: context.frame(), oddity });
+                }
                 let gap = self.builder.take_gap();
                 gap.into_iter().for_each(|why| self.losses.cross(context, why));
                 if !self.builder.has_stood() {
