@@ -62,12 +62,25 @@ pub struct StoreConfig {
     pub path: PathBuf,
     /// Longest time a batch waits for others to share its commit with.
     pub commit_ms: u64,
+    /// What to do about a store that is so damaged that it cannot be opened.
+    pub on_damage: OnDamage,
 }
 
 impl Default for StoreConfig {
     fn default() -> Self {
-        Self { path: "merganser.redb".into(), commit_ms: 20 }
+        Self { path: "merganser.redb".into(), commit_ms: 20, on_damage: OnDamage::Renew }
     }
+}
+
+/// What an agent does about a store that is so damaged that it cannot be opened.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum OnDamage {
+    /// It is moved aside, and an empty store begins a new epoch.
+    #[default]
+    Renew,
+    /// The agent ends, for somebody to look at it first.
+    Stop,
 }
 
 /// How an agent takes part in the Zenoh network.

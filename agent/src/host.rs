@@ -98,6 +98,9 @@ impl Host {
         let core = Agent::new(config.core.clone(), identity, seed, restored, now)?;
         let host = Self::assemble(&config, core, store, journal.transpose()?, clock).await?;
         (0..report.damaged_count).for_each(|_| host.inbox.drops.count("store: damaged record"));
+        if report.renewed.is_some() {
+            host.inbox.drops.count("store: damaged beyond mending, begun anew");
+        }
         Ok(host)
     }
 

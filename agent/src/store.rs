@@ -2,10 +2,11 @@
 //! commit. When the disk refuses, nothing is given up: the agent is told to be receive-only, and the same batches are
 //! tried again, ever more seldom, until they are on disk or the agent ends.
 
-use crate::config::FileConfig;
+use crate::config::{FileConfig, OnDamage};
 use merganser_protocol::agent::io::{Input, Record};
 use merganser_protocol::ids::RobotId;
-use merganser_store::{CommitError, FileMedium, Opened, Owner, Report, Store, StoreError};
+use merganser_store::{CommitError, FileMedium, Opened, Owner, Renewed, Report, Store, StoreError};
+use rand::TryRng;
 use std::collections::VecDeque;
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread::JoinHandle;
@@ -19,6 +20,10 @@ const RETRY: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(10
 /// 2020-01-01 in seconds since 1970: epochs count from there.
 const EPOCH_ORIGIN_SECS: u64 = 1_577_836_800;
 
+/// Where no clock tells which epoch to begin, one is drawn up to here: half a year after 2020, below what any clock that
+/// goes gives.
+const DRAWN_EPOCH_MAX: u32 = 1 << 24;
+
 /// Damaged records named one by one in the log.
 const DAMAGE_TOLD_MAX: usize = 10;
 
@@ -29,18 +34,50 @@ pub fn owner(config: &FileConfig) -> Owner {
     Owner { swarm: config.swarm.clone(), robot: config.robot.clone(), id }
 }
 
-/// Opens the store that a configuration names, and says aloud what was wrong with it.
+/// Opens the store that a configuration names, and says aloud what was wrong with it. One that is too damaged for that is
+/// renewed, if the configuration has it so.
 ///
 /// # Errors
 /// [`StoreError`].
 pub fn open(config: &FileConfig) -> Result<Opened, StoreError> {
     let medium = FileMedium::new(&config.store.path);
-    let opened = Store::open(medium, owner(config), fresh_epoch(SystemTime::now()))?;
+    let now = SystemTime::now();
+    let opened = match Store::open(medium.clone(), owner(config), fresh_epoch(now)) {
+        Err(StoreError::Damaged { .. }) if config.store.on_damage == OnDamage::Renew => {
+            let (written, renewals) = medium.past();
+            Store::renew(medium, owner(config), epoch_after(written, renewals, now))?
+        }
+        opened => opened?,
+    };
     tell(&opened.report);
     Ok(opened)
 }
 
+/// The epoch of a store that takes the place of one last written then, after so many renewals. It must be none that was
+/// used before, even if the file no longer tells which were, the clock went back when the power did, or another one was
+/// renewed a moment ago: a file is written after its epoch began, and renewals are counted.
+fn epoch_after(written: Option<SystemTime>, renewals: u64, now: SystemTime) -> u32 {
+    let renewals = u32::try_from(renewals).unwrap_or(u32::MAX);
+    match fresh_epoch(now).max(written.map_or(0, fresh_epoch)) {
+        0 => rand::rngs::SysRng.try_next_u32().map_or(1, |drawn| 1 + drawn % DRAWN_EPOCH_MAX),
+        last => last.saturating_add(1).saturating_add(renewals),
+    }
+}
+
 fn tell(report: &Report) {
+    let kept = report.kept.as_ref().map_or("nowhere".into(), |path| path.display().to_string());
+    if let Some(Renewed { reason, len, last_epoch, epoch }) = &report.renewed {
+        error!(
+            reason,
+            bytes = len,
+            moved_to = kept,
+            last_epoch,
+            epoch,
+            "the store was damaged beyond mending: it was moved aside, and this robot begins a new epoch with an empty one. \
+             What it published comes back from peers that hold it; what none of them holds, and its own views of \
+             submaps so far, are lost. Check the disk; `merganser store stats` shows what has come back"
+        );
+    }
     if let Some(schema) = report.migrated_from {
         info!(schema, "the store was migrated from an older schema");
     }
@@ -52,7 +89,9 @@ fn tell(report: &Report) {
     }
     let (damaged, entries_lost) = (report.damaged_count, report.entries_lost);
     match &report.unmended {
-        None => error!(damaged, entries_lost, "the store was damaged: it was written anew without what was not sound"),
+        None => {
+            error!(damaged, entries_lost, kept, "the store was damaged: it was written anew without what was not sound")
+        }
         Some(reason) => error!(
             damaged,
             entries_lost,
@@ -221,5 +260,17 @@ mod tests {
         let at = |secs| fresh_epoch(SystemTime::UNIX_EPOCH + Duration::from_secs(secs));
         assert_eq!((at(0), at(EPOCH_ORIGIN_SECS), at(EPOCH_ORIGIN_SECS + 9)), (0, 0, 9));
         assert_eq!(at(1 << 40), 0);
+    }
+
+    #[test]
+    fn a_renewed_store_begins_after_the_old_one_was_written_whatever_the_clock_says() {
+        let at = |secs| SystemTime::UNIX_EPOCH + Duration::from_secs(EPOCH_ORIGIN_SECS + secs);
+        assert_eq!(epoch_after(Some(at(50)), 0, at(90)), 91);
+        assert_eq!(epoch_after(Some(at(90)), 0, at(50)), 91, "the clock went back");
+        assert_eq!((epoch_after(None, 0, at(50)), epoch_after(None, 1, at(50))), (51, 52), "in one second");
+        let stopped = SystemTime::UNIX_EPOCH;
+        let drawn: std::collections::BTreeSet<u32> = (0..20).map(|_| epoch_after(Some(stopped), 3, stopped)).collect();
+        assert!(drawn.len() > 15 && drawn.iter().all(|epoch| (1..=DRAWN_EPOCH_MAX).contains(epoch)), "{drawn:?}");
+        assert!(DRAWN_EPOCH_MAX < fresh_epoch(at(365 * 86_400)), "below all that clocks give");
     }
 }

@@ -38,7 +38,19 @@ pub enum StoreError {
         /// The version found.
         found: String,
     },
-    /// It is no database, or too damaged to tell what it is.
+    /// It was a store, and is so damaged that it cannot be opened.
+    #[error(
+        "store {path} is damaged beyond mending ({reason}); [store] on_damage = \"renew\" moves it aside and begins an empty \
+         one, or move the file away: an empty store begins a new epoch and fetches the swarm's facts again",
+        path = path.display()
+    )]
+    Damaged {
+        /// Where.
+        path: PathBuf,
+        /// What the database said.
+        reason: String,
+    },
+    /// It is no database, and nothing tells that it ever was a store of facts.
     #[error(
         "store {path} is no store of facts ({reason}); check store.path, or move the file away: an empty store begins a \
          new epoch and fetches the swarm's facts again",

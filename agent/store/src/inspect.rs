@@ -6,7 +6,9 @@ use crate::{REFUSING, SCHEMA, SEALED, StoreError, mend};
 use merganser_protocol::agent::io::Record;
 use merganser_protocol::ids::{EntryId, Hash, SubmapId};
 use merganser_protocol::wire::Entry;
-use redb::{Database, ReadableDatabase, ReadableTable, ReadableTableMetadata, TableDefinition, TableError};
+use redb::{
+    Database, ReadableDatabase, ReadableTable, ReadableTableMetadata, TableDefinition, TableError, TableHandle,
+};
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -63,7 +65,7 @@ pub struct Inspection {
 /// # Errors
 /// [`StoreError`] if it cannot be opened at all.
 pub fn inspect(medium: &dyn Medium) -> Result<Inspection, StoreError> {
-    let mut db = mend::open_database(medium)?;
+    let mut db = mend::open_database(medium, None)?;
     read(&mut db).map_err(|reason| StoreError::Failed { path: medium.path().into(), reason })
 }
 
@@ -158,6 +160,13 @@ impl Inspection {
         let missing = || Trouble::Damaged("is missing".into());
         let (schema, trouble) = match meta(db, tables::META_SCHEMA) {
             Ok(Some(schema)) => match number(&schema) {
+                // One bit away from ours there is no other version's.
+                Some(turned)
+                    if (turned ^ SCHEMA).is_power_of_two()
+                        && self.sealed_meta(db, SCHEMA, tables::META_OWNER).is_some() =>
+                {
+                    (Schema::Version(SCHEMA), Some(Trouble::Damaged(format!("is {turned}, which no version writes"))))
+                }
                 Some(version) => (Schema::Version(version), None),
                 // No version writes anything but a number there. Where the owner is sealed as we seal, it is damage.
                 None if self.sealed_meta(db, SCHEMA, tables::META_OWNER).is_some() => {
@@ -165,6 +174,7 @@ impl Inspection {
                 }
                 None => (Schema::Unknown("of unknown form".into()), None),
             },
+            Ok(None) if has_foreign_tables(db) => (Schema::Unknown("that is none of ours".into()), None),
             // No number, but tables: what is sealed says by itself which schema it has.
             Ok(None) if has_tables(db) => (Schema::Version(SCHEMA), Some(missing())),
             Ok(None) => (Schema::New, None),
@@ -371,6 +381,14 @@ fn meta_keys(db: &Database) -> Result<Vec<String>, Trouble> {
         let meta = db.begin_read()?.open_table(META)?;
         meta.iter()?.map(|row| Ok(row?.0.value().to_owned())).collect()
     })
+}
+
+/// Whether there are tables, and each has a name that is none of ours.
+fn has_foreign_tables(db: &Database) -> bool {
+    let ours = [ENTRIES.name(), BLOBS.name(), PRIVATE.name(), FORKS.name(), REFUSED.name(), META.name()];
+    let names =
+        attempt(|| Ok(db.begin_read()?.list_tables()?.map(|table| table.name().to_owned()).collect::<Vec<_>>()));
+    names.is_ok_and(|names| !names.is_empty() && !names.iter().any(|name| ours.contains(&name.as_str())))
 }
 
 /// Whether there are tables, for all that can be read.

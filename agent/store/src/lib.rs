@@ -9,6 +9,9 @@
 //!   sound goes into a new file that takes the old one's place; what is not is counted, dropped, and can be fetched
 //!   from peers again. If an entry may be missing, this robot's log must not be continued, for others may hold what is
 //!   lost: [`Record::EpochClosed`] says so, at every start until a later epoch has begun.
+//! - *What cannot be opened at all is told apart*: a store of ours that is damaged ([`StoreError::Damaged`]) can be
+//!   renewed, if whoever opens it wants that; what was never one, belongs to somebody else or cannot be read now is left
+//!   alone.
 //! - *A disk that refuses loses nothing*: a failed commit stores nothing of its batch; the next one opens the database
 //!   again. After anything but a full disk the records are first copied into a new file, since a kernel forgets pages
 //!   that it could not write.
@@ -23,11 +26,12 @@ mod mend;
 #[cfg(feature = "simulated")]
 pub mod simulated;
 mod tables;
+mod traces;
 
 pub use error::{CommitError, StoreError};
-pub use file::FileMedium;
+pub use file::{DAMAGED_KEPT_MAX, FileMedium};
 pub use inspect::{Damage, Inspection, Schema, inspect};
-pub use mend::{Medium, Opened, Report};
+pub use mend::{Medium, Opened, Renewed, Report};
 
 use merganser_protocol::agent::io::Record;
 use merganser_protocol::ids::{Name, RobotId};
@@ -80,6 +84,16 @@ impl Store {
     /// [`StoreError`]; nothing is changed then.
     pub fn open(medium: impl Medium + 'static, owner: Owner, fresh_epoch: u32) -> Result<Opened, StoreError> {
         mend::open(Box::new(medium), owner, fresh_epoch)
+    }
+
+    /// After [`StoreError::Damaged`]: puts an empty store in the place of one that cannot be opened, which is kept beside
+    /// it. The epoch that it begins is `fresh_epoch`, or above the last one that the damaged file still names as this
+    /// robot's own; those before are closed. A store that can be opened after all is opened.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing is changed then.
+    pub fn renew(medium: impl Medium + 'static, owner: Owner, fresh_epoch: u32) -> Result<Opened, StoreError> {
+        mend::renew(Box::new(medium), owner, fresh_epoch)
     }
 
     /// Makes records durable, in one synced commit. If an earlier commit failed, the database is opened again first.

@@ -9,7 +9,7 @@ use crate::Medium;
 use redb::{Builder, Database, DatabaseError, StorageBackend};
 use std::fmt;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// What a disk writes in one piece.
@@ -187,11 +187,22 @@ impl Medium for Disk {
         builder.create_with_backend(handle)
     }
 
-    fn promote_spare(&self, _keep: bool) -> io::Result<()> {
+    fn promote_spare(&self, _keep: bool) -> io::Result<Option<PathBuf>> {
         let mut platter = lock(&self.0);
         lock(&platter.faults).operate()?;
         platter.main = std::mem::take(&mut platter.spare);
-        Ok(())
+        Ok(None)
+    }
+
+    /// An empty disk is one that was never written.
+    fn is_emptied(&self) -> io::Result<bool> {
+        Ok(false)
+    }
+
+    fn bytes(&self) -> io::Result<Box<dyn io::Read + '_>> {
+        let platter = lock(&self.0);
+        lock(&platter.faults).read()?;
+        Ok(Box::new(io::Cursor::new(lock(&platter.main).seen.clone())))
     }
 }
 

@@ -29,7 +29,7 @@ impl<C: Restartable> Swarm<C> {
             Ok(booted) => booted,
             // The advice that the error gives is taken: the file is moved away. (No other version is here: its number
             // was hit.)
-            Err(StoreError::NotAStore { .. } | StoreError::Schema { .. }) => {
+            Err(StoreError::Damaged { .. } | StoreError::NotAStore { .. } | StoreError::Schema { .. }) => {
                 self.wipe(index);
                 self.counts.store_moved_away += 1;
                 return self.boot(now, index);
