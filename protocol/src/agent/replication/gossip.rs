@@ -413,9 +413,9 @@ impl Replication {
             let postponed = delta.more && is_empty;
             return self.note(query, if postponed { Answer::Postponed } else { Answer::Got { new, more: delta.more } });
         }
-        let Some(question) = self.gossip.questions.get_mut(&query) else { return };
-        question.is_settled = true;
-        let question = Question { is_settled: false, ..*question };
+        let Some(asked) = self.gossip.questions.get_mut(&query) else { return };
+        let question = *asked;
+        asked.is_settled = true;
         self.synced(context, &question, Answer::Got { new, more: delta.more });
     }
 
