@@ -77,7 +77,7 @@ fn is_renewed(path: &Path, bytes: &[u8], what: &str) -> u32 {
     assert_eq!((renewed.len, renewed.epoch), (bytes.len() as u64, restored.fresh_epoch), "{what}");
     assert!(report.entries_lost && restored.fresh_epoch >= 7, "{what}");
     let closed = Record::EpochClosed { epoch: restored.fresh_epoch - 1 };
-    assert_eq!(restored.records, [closed.clone()], "{what}");
+    assert_eq!(restored.records, std::slice::from_ref(&closed), "{what}");
     store.commit(alpha().1.iter()).unwrap();
     drop(store);
     let again = open(path).unwrap();
