@@ -16,7 +16,8 @@
 //!   pause that doubles until either side changes.
 //! - **Nobody signs announcements**, and an outsider may make them in anyone's name. So a neighbour whose claims came to
 //!   nothing several times in a row waits for the others, and whoever was not asked for a minute is asked in any case,
-//!   less often as long as that brings nothing. Claims thus delay, and starve nobody.
+//!   less often as long as that brings nothing, and of more than eight one after the other. Claims thus delay, and starve
+//!   nobody.
 //! - What goes out is counted against a [`Budget`] by class; a neighbour whose link has no room says so, and is asked
 //!   again later.
 
@@ -92,6 +93,8 @@ pub struct AntiEntropy {
     bucket: TokenBucket,
     experience: Experience,
     answer_max: Duration,
+    /// When a neighbour was last asked whatever it is said to hold.
+    checked: Instant,
     wake: Instant,
 }
 
@@ -105,6 +108,7 @@ impl AntiEntropy {
             bucket: TokenBucket::new(QUESTIONS_PER_SEC, QUESTIONS_AT_ONCE, now),
             experience: Experience::new(),
             answer_max: Duration::from_secs_f64(answer_secs),
+            checked: Instant::ZERO,
             wake: now,
         }
     }
@@ -254,7 +258,8 @@ impl AntiEntropy {
     /// name must not keep us from what that other holds.
     fn check(&mut self, now: Instant, replica: &Replica) -> Option<Step> {
         let waiting = self.neighbours.iter().filter(|(_, neighbour)| neighbour.asked.is_none());
-        let (due, peer) = waiting.map(|(robot, neighbour)| (neighbour.check_due(), *robot)).min()?;
+        let due = |neighbour: &Neighbour| (neighbour.check_due(self.checked), neighbour.attended);
+        let ((due, _), peer) = waiting.map(|(robot, neighbour)| (due(neighbour), *robot)).min()?;
         let due = due.max(self.bucket.due(now, 1.0, 1.0));
         if now < due {
             self.wake = self.wake.min(due);
@@ -262,7 +267,7 @@ impl AntiEntropy {
         }
         let neighbour = self.neighbours.get_mut(&peer)?;
         self.bucket.pay(now, 1.0, 1.0);
-        self.wake = now;
+        (self.wake, self.checked) = (now, now);
         let have = neighbour.check(now, self.me, replica, Stake { gain: 1.0, copies: 1.0 });
         Some(Step::Ask { peer, have })
     }

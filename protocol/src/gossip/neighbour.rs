@@ -37,6 +37,9 @@ const VAIN_FREE: u32 = 3;
 pub(super) const CHECK_AFTER: Duration = Duration::from_secs(60);
 /// ...and after checks that brought nothing after twice as long, up to this, until something new is heard.
 pub(super) const CHECK_AFTER_MAX: Duration = Duration::from_secs(480);
+/// Of many neighbours that are due to be checked one is, and the next after this share of its pause: what checks cost does
+/// not grow with the swarm. Up to so many neighbours are each checked when they are due.
+const CHECKED_IN_TURN: u32 = 8;
 /// Shortest patience with a question: less, and answers that were only queued are fetched twice.
 const PATIENCE_MIN: Duration = Duration::from_millis(300);
 /// Patience with a question for each fact that is expected: of few facts little is lost if they are fetched twice.
@@ -70,7 +73,7 @@ pub(super) struct Neighbour {
     /// Questions in a row that brought nothing.
     in_vain: u32,
     /// When it was last asked, or came into reach.
-    attended: Instant,
+    pub(super) attended: Instant,
     /// How long after that it is asked in any case.
     check_after: Duration,
 }
@@ -128,9 +131,9 @@ impl Neighbour {
         }
     }
 
-    /// When it is asked in any case.
-    pub fn check_due(&self) -> Instant {
-        self.attended.after(self.check_after)
+    /// When it is asked in any case, if the last check of anybody was `checked`.
+    pub fn check_due(&self, checked: Instant) -> Instant {
+        self.attended.after(self.check_after).max(checked.after(self.check_after / CHECKED_IN_TURN))
     }
 
     /// Something is new here: checks may bring something again.
@@ -139,7 +142,7 @@ impl Neighbour {
     }
 
     /// How much its claims are to be doubted: of two neighbours that promise something the one with less comes first.
-    /// 0 for whoever has not asked for patience too often.
+    /// 0 for whoever brought something with one of the last questions.
     pub fn doubt(&self) -> u32 {
         self.in_vain.saturating_sub(VAIN_FREE - 1)
     }

@@ -346,3 +346,18 @@ fn claims_in_the_name_of_who_has_what_is_missing_only_delay() {
     let took = under(&[1], false, the_same);
     assert!(took.is_some_and(|secs| secs < 61.0), "{took:?}");
 }
+
+#[test]
+fn checks_cost_no_more_in_a_large_swarm() {
+    // Bytes of questions a second and robot, once all hold the same: each robot asks one neighbour a minute at most.
+    let quiet = |n: u8| {
+        let mut swarm = Swarm::new(n, |_, _| true, 0.0);
+        swarm.give(0, &chain(0, 0, 5, 0));
+        assert!(swarm.run(1_000.0, false));
+        swarm.control = [0; 2];
+        assert!(swarm.run(2_000.0, false));
+        swarm.control[1] as f64 / f64::from(n) / 1_000.0
+    };
+    let [few, many] = [quiet(4), quiet(32)];
+    assert!(few > 0.1 && many < 1.5 * 8.0 / 3.0 * few, "{few} and {many} B/s");
+}
