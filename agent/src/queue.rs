@@ -13,9 +13,8 @@ use tokio::sync::mpsc;
 
 /// Bytes of waiting outside input at most.
 pub const QUEUED_BYTES_MAX: usize = 32 << 20;
-/// Bytes of waiting answers to questions of ours at most. Anyone may answer, so they are bounded; what is left of room
-/// is enough for [`MESSAGE_LEN_MAX`](merganser_protocol::wire::limits::MESSAGE_LEN_MAX) bytes for each question under
-/// way.
+/// Bytes of waiting answers to questions of ours at most: of the longest that a peer gives, 64 KiB, more than a hundred.
+/// Anyone may answer, so they are bounded.
 pub const ANSWERS_BYTES_MAX: usize = 8 << 20;
 /// A single source may fill this part of the queue: one in so many.
 const SHARE: usize = 4;

@@ -240,6 +240,7 @@ impl Agent {
                     self.alignment.on_blob(query, hash, self.context.now());
                 }
             }
+            Reply::PutOff(hash) => self.alignment.on_put_off(query, hash, self.context.now()),
             Reply::NoPiece => self.alignment.on_no_piece(query, self.context.now()),
         }
     }

@@ -98,8 +98,8 @@ impl Fetches {
         }
     }
 
-    /// A piece of a blob came that is as its address says, or an empty one: it is put off. Pieces may come from different
-    /// robots. The next is not asked for before `next_piece`. All bytes, if it was the last.
+    /// A piece of a blob came that is as its address says. Pieces may come from different robots. The next is not asked
+    /// for before `next_piece`. All bytes, if it was the last.
     pub(super) fn on_piece(
         &mut self,
         query: QueryId,
@@ -111,9 +111,6 @@ impl Fetches {
         let Some(fetch) = self.wanted.get_mut(&hash) else { return Piece::Taken };
         let left = (total as usize).saturating_sub(fetch.got.len());
         let goes_on = offset as usize == fetch.got.len() && left > 0;
-        if goes_on && piece.is_empty() {
-            return self.put_off_by_holder(query, hash, now);
-        }
         if !goes_on {
             return self.failed(query, now);
         }
@@ -129,7 +126,10 @@ impl Fetches {
 
     /// The holder of a blob has no room on its link: it is asked again after a pause, and after many counts as one that
     /// does not have it.
-    fn put_off_by_holder(&mut self, query: QueryId, hash: Hash, now: Instant) -> Piece {
+    pub(super) fn put_off_by_holder(&mut self, query: QueryId, hash: Hash, now: Instant) -> Piece {
+        if !self.wanted.contains_key(&hash) {
+            return Piece::Taken;
+        }
         self.postponed.retain(|hash, _| self.wanted.contains_key(hash));
         let times = self.postponed.entry(hash).or_default();
         *times += 1;

@@ -261,6 +261,12 @@ impl Alignment {
         self.after_piece(came)
     }
 
+    /// The holder of a piece has no room on its link.
+    pub(super) fn on_put_off(&mut self, query: QueryId, hash: Hash, now: Instant) {
+        let came = self.fetches.put_off_by_holder(query, hash, now);
+        self.after_piece(came);
+    }
+
     /// A question for a piece was in vain.
     pub(super) fn on_no_piece(&mut self, query: QueryId, now: Instant) {
         let came = self.fetches.failed(query, now);

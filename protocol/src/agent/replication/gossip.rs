@@ -71,13 +71,15 @@ pub(in crate::agent) enum Reply {
     Nothing,
     /// Entries and proofs that are to be taken in; this robot was asked.
     Delta(RobotId, Delta),
-    /// A piece of a blob that is as it should be, or, if it is empty, is put off.
+    /// A piece of a blob, as it should be.
     Piece {
         hash: Hash,
         offset: u32,
         total: u32,
         bytes: Vec<u8>,
     },
+    /// The next piece of this blob is put off.
+    PutOff(Hash),
     /// No piece of a blob.
     NoPiece,
 }
@@ -383,22 +385,20 @@ impl Replication {
                 self.synced(context, &question, answer);
                 Reply::Nothing
             }
-            (About::Blob(hash, offset), Answer::Postponed) => {
-                Reply::Piece { hash, offset: offset as u32, total: u32::MAX, bytes: Vec::new() }
-            }
+            (About::Blob(hash, _), Answer::Postponed) => Reply::PutOff(hash),
             (About::Blob(..), _) => Reply::NoPiece,
             (About::Align, _) => Reply::Nothing,
         }
     }
 
-    /// Notes an answer that proved nothing. One that says that there is something is believed before one that says that
-    /// there is not: both may be false, and to ask once more costs little.
+    /// Notes an answer that proved nothing. All may be false: "nothing" counts before "not now", because after it the next
+    /// window is asked about, while whoever says "not now" again and again would keep us at this one.
     fn note(&mut self, query: QueryId, answer: Answer) {
         let rank = |answer: &Answer| match answer {
             Answer::Failed => 0,
             Answer::Refused => 1,
-            Answer::Got { .. } => 2,
-            Answer::Postponed => 3,
+            Answer::Postponed => 2,
+            Answer::Got { .. } => 3,
         };
         let question = self.gossip.questions.get_mut(&query);
         if let Some(question) = question.filter(|question| rank(&answer) > rank(&question.unproved)) {
