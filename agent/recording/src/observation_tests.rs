@@ -192,6 +192,26 @@ fn decoding_takes_the_whole_input_and_known_fields_alone() {
     assert!(matches!(keyframe(Format::Json, json.to_string().as_bytes()), Err(ObservationError::Json(_))));
 }
 
+/// Wheel odometry's drivers mark z, roll and pitch so.
+#[test]
+fn axes_that_are_marked_as_not_measured_are_taken_as_very_uncertain() {
+    for mark in [-1.0, 0.0] {
+        let mut marked = message();
+        for place in [11, 15, 18] {
+            marked.covariance[place] = mark;
+        }
+        for other in [2, 3, 4, 7, 8, 9, 12, 13, 14, 16, 17, 19] {
+            marked.covariance[other] = 0.0;
+        }
+        let taken = keyframe(Format::Json, &serde_json::to_vec(&marked).unwrap()).unwrap();
+        let sigmas = taken.pose.covariance.sigmas();
+        assert!(sigmas.fixed_rows::<3>(2).min() == 1e3 && sigmas[0] < 1.0 && sigmas[5] < 1.0, "{sigmas}");
+        marked.covariance[0] = mark;
+        let refused = keyframe(Format::Json, &serde_json::to_vec(&marked).unwrap());
+        assert!(matches!(refused, Err(ObservationError::Covariance(_))), "what a robot must measure: {refused:?}");
+    }
+}
+
 #[test]
 fn organised_clouds_leave_out_what_was_not_measured_and_others_are_refused_for_it() {
     let holes = [[f32::NAN; 3], [1.0, 2.0, f32::NAN], [f32::INFINITY, 0.0, 0.0], [0.0, f32::NEG_INFINITY, 0.0]];

@@ -234,6 +234,20 @@ fn bad_tables_are_told_with_their_line() {
 }
 
 #[test]
+fn axes_that_a_table_marks_as_not_measured_are_taken_as_very_uncertain() {
+    for mark in ["-1", "0"] {
+        let dir = good();
+        for column in [19, 23, 26] {
+            set_field(&dir.path().join("keyframes.csv"), 1, column, mark);
+        }
+        let recording = Recording::open(dir.path()).unwrap();
+        let sigmas = recording.keyframes()[0].pose.covariance.sigmas();
+        assert_eq!((sigmas[2], sigmas[3], sigmas[4]), (1e3, 1e3, 1e3));
+        assert!(sigmas[0] < 1e3 && sigmas[5] < 1e3);
+    }
+}
+
+#[test]
 fn bad_clouds_are_told_when_they_are_read() {
     let dir = good();
     let recording = Recording::open(dir.path()).unwrap();

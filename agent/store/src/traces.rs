@@ -161,7 +161,7 @@ fn entry_at(window: &[u8], at: usize, owner: &Owner) -> Option<EntryId> {
     varint(&mut rest)?; // the floor
     rest = rest.get(32..)?; // the hash of the one before
     let payload = varint(&mut rest)? as usize;
-    let end = window.len() - rest.len() + payload + SIGNATURE;
+    let end = (window.len() - rest.len() + SIGNATURE).checked_add(payload)?;
     let sealed = window.get(at.checked_sub(8)?..end)?;
     let id = EntryId { frame: FrameId { robot: owner.id, epoch }, seq };
     let bytes = unseal("entries", &tables::join_key(id.frame, seq), sealed)?;

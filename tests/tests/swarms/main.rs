@@ -9,3 +9,4 @@ mod laser;
 mod real_data;
 mod scales;
 mod swarm;
+mod unmeasured;

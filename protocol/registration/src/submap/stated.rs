@@ -20,8 +20,8 @@ use serde::Serialize;
 const NAMES: [&str; 6] = ["x", "y", "z", "roll", "pitch", "yaw"];
 /// Those that may be unmeasured, and those of their kind that must be measured then.
 const KINDS: [([usize; 2], [usize; 2]); 2] = [([2, 2], [0, 1]), ([3, 4], [5, 5])];
-/// A rotation of this standard deviation, rad, is not known.
-const TURN_SIGMA_MAX: f64 = 0.5;
+/// A rotation with a larger standard deviation, rad, is not known: no Gaussian about one rotation means much beyond.
+pub const TURN_SIGMA_MAX: f64 = 0.5;
 /// Two variances are the same if they differ by less than this share: what writing them as text leaves.
 const SAME: f64 = 1e-9;
 /// Submaps in a row that end by what is stated after a single keyframe, from which on it is no gap but a habit.

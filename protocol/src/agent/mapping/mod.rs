@@ -5,8 +5,9 @@ mod losses;
 mod path;
 mod sighting;
 
+pub use crate::submap::stated::TURN_SIGMA_MAX;
 pub use path::PATH_KEYFRAMES_MAX;
-pub use sighting::{SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
+pub use sighting::SIGHTING_AGE_SECS_MAX;
 
 use super::context::Context;
 use super::io::{EpochReason, Event, JobId, Record};

@@ -12,6 +12,7 @@ use crate::agent::motion::moved_on;
 use crate::agent::replication::beacons::{Beacons, LATE_SIGMA_SECS};
 use crate::geometry::{Covariance, PoseWithCovariance, Se3, So3};
 use crate::ids::{Name, SubmapId};
+use crate::submap::stated::TURN_SIGMA_MAX;
 use crate::time::Stamp;
 use crate::wire::fact::{Fact, PositionFact, SightingFact};
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3};
@@ -19,9 +20,6 @@ use std::collections::BTreeMap;
 
 /// Largest time between a sighting and the keyframe or beacon that tells where a robot was, s.
 pub const SIGHTING_AGE_SECS_MAX: f64 = 5.0;
-/// A sighting whose rotation has a larger standard deviation, rad, tells where the other robot is, not how it is
-/// turned: no Gaussian about one rotation means much beyond.
-pub const TURN_SIGMA_MAX: f64 = 0.5;
 /// Another position from the same submap to the same one is stated with so much of the variance at most.
 const NEWS: f64 = 0.5;
 
