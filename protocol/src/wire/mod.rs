@@ -13,6 +13,8 @@ pub mod have;
 mod json;
 mod lattice;
 pub mod limits;
+#[cfg(test)]
+mod limits_tests;
 pub mod messages;
 pub mod payload;
 pub mod pose;
