@@ -18,7 +18,7 @@ use fuzzing::{ALLOCATION_MAX, Meter};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::cell::Cell;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use tracking_allocator::{AllocationGroupId, AllocationRegistry, AllocationTracker, Allocator};
 
 #[global_allocator]
@@ -71,7 +71,7 @@ fn run(target: &str, bytes: &[u8]) {
 }
 
 fn fuzz_folder() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz")
+    PathBuf::from("fuzz")
 }
 
 /// Every file of a target's corpus, in the order of their names.

@@ -6,7 +6,7 @@ use merganser_sim::scenario::Scenario;
 
 #[test]
 fn all_scenarios_are_good() {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenarios");
+    let folder = "scenarios";
     let mut count = 0;
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();

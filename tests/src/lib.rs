@@ -22,7 +22,7 @@ pub fn simulate(scenario: &str, seed: u64) -> Result<Report, String> {
 /// workspace.
 #[allow(clippy::print_stderr, reason = "a test that was skipped must say so")]
 pub fn real_data(name: &str) -> Option<std::path::PathBuf> {
-    let beside = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared");
+    let beside = std::path::PathBuf::from("../../shared");
     let folder = std::env::var_os("MERGANSER_SHARED").map_or(beside, Into::into).join("data").join(name);
     if !folder.is_dir() {
         eprintln!("skipped: no real data at {} (set MERGANSER_SHARED)", folder.display());

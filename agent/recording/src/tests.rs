@@ -344,8 +344,7 @@ fn lidar_scans_of_both_kinds_are_cut_into_robots() {
 
 /// The folder of data sets, or why there is none.
 fn shared(path: &str) -> Option<PathBuf> {
-    let shared = std::env::var_os("MERGANSER_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
+    let shared = std::env::var_os("MERGANSER_SHARED").map_or_else(|| PathBuf::from("../../../shared"), PathBuf::from);
     let folder = shared.join("data").join(path);
     if !folder.is_dir() {
         println!("skipped: {} is absent (set MERGANSER_SHARED)", folder.display());

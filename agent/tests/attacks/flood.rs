@@ -36,7 +36,7 @@ async fn strangers_in_any_number_cost_no_memory_and_stop_nobody() {
         config.save(&folder.join(format!("{}.toml", config.robot))).unwrap();
     }
     let run = |robot: &str| {
-        let recording = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings").join(robot);
+        let recording = std::path::absolute("recordings").unwrap().join(robot);
         Agent::run(folder, robot, &["--recording", recording.to_str().unwrap(), "--speed", "10"])
     };
     let agents = [run("alpha"), run("beta")];
@@ -94,7 +94,7 @@ async fn state(outsider: &mut Outsider, first: u64) -> f64 {
 
 /// Of the last keyframe of a robot's recording, ns.
 fn last_stamp(robot: &str) -> i64 {
-    let table = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings").join(robot).join("keyframes.csv");
+    let table = Path::new("recordings").join(robot).join("keyframes.csv");
     let text = std::fs::read_to_string(table).unwrap();
     text.lines().last().unwrap().split(',').next().unwrap().parse().unwrap()
 }

@@ -18,7 +18,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_merganser");
-const RECORDINGS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/recordings");
+const RECORDINGS: &str = "recordings";
 
 /// However slow the link and the computer are, a test ends.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -190,7 +190,7 @@ impl<'a> Robot<'a> {
         command.args(["run", "--leash", "--config"]).arg(config);
         self.keyframes = 0;
         if let Some(speed) = speed {
-            let recording = Path::new(RECORDINGS).join(&self.name);
+            let recording = std::path::absolute(RECORDINGS).unwrap().join(&self.name);
             let table = fs::read_to_string(recording.join("keyframes.csv")).unwrap();
             self.keyframes = table.lines().count() as u64 - 1;
             command.args(["--speed", &speed.to_string(), "--recording"]).arg(recording);

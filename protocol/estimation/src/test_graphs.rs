@@ -103,8 +103,7 @@ pub fn read_g2o(text: &str) -> (Vec<(SubmapId, Se3)>, Vec<Factor<SubmapId>>) {
 
 /// A file of the shared data, or `None` (with the reason printed) where it is absent.
 pub fn shared(path: &str) -> Option<String> {
-    let root = std::env::var_os("MERGANSER_SHARED")
-        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
+    let root = std::env::var_os("MERGANSER_SHARED").map_or_else(|| PathBuf::from("../../../shared"), PathBuf::from);
     let file = root.join(path);
     match std::fs::read_to_string(&file) {
         Ok(text) => Some(text),

@@ -16,7 +16,7 @@ const KINDS: [QueryKind; 3] = [QueryKind::Sync, QueryKind::Blob, QueryKind::Alig
 
 /// Every frozen message and entry of version 1.
 fn golden() -> Vec<Vec<u8>> {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/golden/v1");
+    let folder = "golden/v1";
     let mut paths: Vec<_> = std::fs::read_dir(folder).unwrap().map(|file| file.unwrap().path()).collect();
     paths.retain(|path| path.extension().is_some_and(|extension| extension == "bin"));
     paths.sort();

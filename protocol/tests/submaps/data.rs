@@ -28,7 +28,7 @@ pub struct Set {
 
 /// The data folder, or a printed reason why there is none.
 pub fn shared() -> Option<PathBuf> {
-    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared");
+    let beside = PathBuf::from("../../shared");
     let folder = std::env::var_os("MERGANSER_SHARED").map_or(beside, PathBuf::from).join("data");
     if !folder.is_dir() {
         println!("skipped: no real data at {} (set MERGANSER_SHARED)", folder.display());

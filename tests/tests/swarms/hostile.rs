@@ -21,8 +21,7 @@ use std::path::Path;
 
 /// The first two of the robots that come with the program.
 fn recordings() -> Vec<Recording> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../agent/recordings");
-    open_all(&folder).unwrap().into_iter().take(2).collect()
+    open_all(Path::new("../agent/recordings")).unwrap().into_iter().take(2).collect()
 }
 
 fn snapshot(wires: &Wires, robot: usize) -> Snapshot {

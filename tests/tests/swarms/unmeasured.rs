@@ -15,7 +15,7 @@ const DIAGONAL: [usize; 6] = [8, 14, 19, 23, 26, 28];
 /// The first two of the robots that come with the program, with these variances stated for these axes.
 fn stated(variance: &str, axes: core::ops::Range<usize>) -> Wires {
     let dir = tempfile::tempdir().unwrap();
-    let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("../agent/recordings");
+    let from = Path::new("../agent/recordings");
     for robot in ["alpha", "beta"] {
         let to = dir.path().join(robot);
         copy(&from.join(robot), &to);
