@@ -130,8 +130,8 @@ pub enum Unused {
     /// A loop closure that contradicts other loop closures.
     #[error("contradicts other loop closures of its frame")]
     OtherLoops,
-    /// Its pair of frames contradicts the chain of stronger pairs between the same frames.
-    #[error("its pair contradicts a loop of frames")]
+    /// Pairs of frames around a loop contradict one another, and its pair is among those that may be wrong.
+    #[error("pairs of frames around a loop contradict one another, and its pair may be the one that is wrong")]
     FrameLoop,
     /// It contradicts the rest of the map.
     #[error("contradicts the rest of the map (leave-one-out chi2 {0:.1})")]

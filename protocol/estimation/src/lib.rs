@@ -22,12 +22,14 @@
 //! ```
 
 mod admission;
+pub mod blame;
 pub mod certificate;
 pub mod chordal;
 mod cloud_covariance;
 pub mod distortion;
 mod drift_model;
 pub mod extrapolation;
+mod forest;
 pub mod frames;
 pub mod graph;
 pub mod incremental;

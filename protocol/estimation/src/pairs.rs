@@ -1,18 +1,19 @@
 //! Pairs of frames: decides which of them merge before the joint estimate is solved (MATH §5, DESIGN §6.6).
 //!
 //! Each pair's alignments go through the frame-level consensus. Merged pairs are then taken from the strongest (lowest
-//! number of false alarms) to the weakest into a spanning forest, which also gives the start of the joint estimate. A
-//! pair that closes a loop of frames must agree with the stronger pairs around it (χ², 99.99 %), or it is left out: a
-//! false merge is worse than a missing one.
+//! number of false alarms) to the weakest into a spanning forest, which also gives the start of the joint estimate. Pairs
+//! that contradict one another around a loop are left out as [`blame`] says: a false merge is worse than a missing one.
 
 use super::admission::{Admission, Chain};
+use super::blame::{self, Blame};
+use super::forest::{Forest, Tie};
 use super::frames::{FrameConsensusConfig, FrameOutcome, PairAlignment, align_frames, align_frames_sim, promising};
 use super::graph::is_rigid;
 use super::joint::{AgreedAlignment, EdgeEstimate, JointEstimate, Unused};
 use super::loops::{self, Loops};
 use super::verdicts::{Verdict, Verdicts};
 use crate::config::EstimateConfig;
-use crate::geometry::{Disagreement, Relative, Sim3, chi2};
+use crate::geometry::{Relative, Sim3};
 use crate::ids::{FrameId, SubmapId};
 use crate::kinds::PairStatus;
 use std::collections::{BTreeMap, BTreeSet};
@@ -51,8 +52,8 @@ pub struct PairEstimate {
     /// Of a merged pair: how the two lie in the middle of what both saw. The origins of the frames may be far from it,
     /// and [`PairEstimate::t_a_b`] as uncertain as the way there.
     pub middle: Option<Middle>,
-    /// The pair agrees with itself but contradicts a loop of stronger pairs, so it was left out.
-    pub contradicts_loop: bool,
+    /// The pair agrees with itself but was left out, for pairs around a loop contradict one another: who may be wrong.
+    pub blame: Option<Blame>,
 }
 
 /// How two anchors of different frames lie by the joint estimate.
@@ -77,7 +78,7 @@ pub(super) struct Pair {
     /// What a second look found is judged by the map.
     second_looks: Vec<usize>,
     outcome: Outcome,
-    contradicts_loop: bool,
+    blame: Option<Blame>,
     /// Part of the spanning forest.
     in_tree: bool,
 }
@@ -126,7 +127,7 @@ pub(super) fn consensus(admission: &mut Admission, config: &EstimateConfig, know
             outcome.unless_ambiguous(ambiguous, members.len())
         };
         let second_looks = second.remove(&(a, b)).unwrap_or_default();
-        Pair { a, b, members, weighed, second_looks, outcome, contradicts_loop: false, in_tree: false }
+        Pair { a, b, members, weighed, second_looks, outcome, blame: None, in_tree: false }
     };
     let mut pairs: Vec<Pair> = members.into_iter().zip(verdicts).map(&mut pair).collect();
     for pair in &pairs {
@@ -155,7 +156,7 @@ fn repeating(loops: &BTreeMap<FrameId, Loops>, ambiguous: &BTreeMap<(FrameId, Fr
 /// the world is in metres, and so are all such frames, also those reached through one of unknown scale: what the way
 /// there says of a scale is not exact, and no later step could put it right.
 pub(super) fn start(admission: &Admission, pairs: &[Pair]) -> BTreeMap<SubmapId, Sim3> {
-    let forest = Forest::of(pairs);
+    let forest = forest(pairs);
     let mut world: BTreeMap<FrameId, Sim3> = BTreeMap::new();
     let is_metric = |frame: &FrameId| !admission.unknown_scale.contains(frame);
     let (metric, unknown): (Vec<FrameId>, Vec<FrameId>) = admission.chains.keys().partition(|&frame| is_metric(frame));
@@ -212,6 +213,21 @@ impl Pair {
         }
     }
 
+    fn is_merged(&self) -> bool {
+        self.outcome.status == PairStatus::Merged
+    }
+
+    fn tie(&self) -> Option<Tie> {
+        self.outcome.t_a_b.map(|t_a_b| Tie { a: self.a, b: self.b, t_a_b })
+    }
+
+    /// Pairs around a loop contradict one another, and this one may be wrong.
+    fn leave_out(&mut self, admission: &mut Admission, blame: Blame) {
+        self.blame = Some(blame);
+        self.outcome.status = PairStatus::Inconsistent;
+        self.refuse(admission, Unused::FrameLoop);
+    }
+
     fn refuse(&self, admission: &mut Admission, reason: Unused) {
         for &k in &self.members {
             admission.edges[k].joins = false;
@@ -231,7 +247,7 @@ impl Pair {
             log10_nfa: self.outcome.log10_nfa,
             t_a_b: map.frame(self.a, self.b).or(self.outcome.t_a_b),
             middle: self.middle(map),
-            contradicts_loop: self.contradicts_loop,
+            blame: self.blame,
         }
     }
 }
@@ -284,63 +300,27 @@ pub(super) fn sigma_scales(pairs: &[Pair]) -> BTreeMap<(FrameId, FrameId), f64> 
     merged.map(|p| ((p.a, p.b), p.outcome.sigma_scale)).collect()
 }
 
-/// Takes merged pairs into the forest, the strongest first, and leaves out those that contradict a loop.
+/// Takes merged pairs into the forest, the strongest first, and leaves out those to blame for contradictions.
 fn span(admission: &mut Admission, pairs: &mut [Pair]) {
-    let mut order: Vec<usize> = (0..pairs.len()).collect();
-    let nfa = |k: usize| pairs[k].outcome.log10_nfa.unwrap_or(f64::INFINITY);
-    order.retain(|&k| pairs[k].outcome.status == PairStatus::Merged);
-    order.sort_by(|&x, &y| nfa(x).total_cmp(&nfa(y)).then(x.cmp(&y)));
-    for k in order {
-        let path = Forest::of(pairs).reach(pairs[k].a).remove(&pairs[k].b).flatten();
-        let Some(own) = pairs[k].outcome.t_a_b else { continue };
-        match path {
-            None => pairs[k].in_tree = true,
-            Some(path) if agree(&path.disagreement(&own)) => {}
-            Some(_) => {
-                pairs[k].contradicts_loop = true;
-                pairs[k].outcome.status = PairStatus::Inconsistent;
-                pairs[k].refuse(admission, Unused::FrameLoop);
-            }
-        }
+    let nfa = |k: &usize| pairs[*k].outcome.log10_nfa.unwrap_or(f64::INFINITY);
+    let mut order: Vec<usize> = (0..pairs.len()).filter(|&k| pairs[k].is_merged()).collect();
+    order.sort_by(|x, y| nfa(x).total_cmp(&nfa(y)).then(x.cmp(y)));
+    order.retain(|&k| pairs[k].outcome.t_a_b.is_some());
+    let ties: Vec<Tie> = order.iter().filter_map(|&k| pairs[k].tie()).collect();
+    let settled = blame::settle(&ties);
+    settled.tree.into_iter().for_each(|k| pairs[order[k]].in_tree = true);
+    for (k, blame) in settled.out {
+        pairs[order[k]].leave_out(admission, blame);
     }
-}
-
-fn agree(d: &Disagreement) -> bool {
-    d.distance_squared <= chi2::P9999[5 + usize::from(d.degrees_of_freedom == 7)]
 }
 
 /// The spanning forest of merged frames.
-struct Forest(BTreeMap<FrameId, Vec<(FrameId, Relative)>>);
-
-impl Forest {
-    fn of(pairs: &[Pair]) -> Self {
-        let mut neighbours: BTreeMap<FrameId, Vec<(FrameId, Relative)>> = BTreeMap::new();
-        for pair in pairs.iter().filter(|p| p.in_tree) {
-            if let Some(t_a_b) = pair.outcome.t_a_b {
-                neighbours.entry(pair.a).or_default().push((pair.b, t_a_b));
-                neighbours.entry(pair.b).or_default().push((pair.a, t_a_b.inverse()));
-            }
-        }
-        Self(neighbours)
+fn forest(pairs: &[Pair]) -> Forest {
+    let mut forest = Forest::default();
+    for (k, pair) in pairs.iter().enumerate().filter(|(_, pair)| pair.in_tree) {
+        pair.tie().into_iter().for_each(|tie| forest.add(k, &tie));
     }
-
-    /// Every frame connected to `root`, with `t_root_frame` (`None` for the root itself) compounded along the way: its
-    /// covariance takes the pairs as independent, which overstates it where they share a trajectory.
-    fn reach(&self, root: FrameId) -> BTreeMap<FrameId, Option<Relative>> {
-        let mut reached = BTreeMap::from([(root, None)]);
-        let mut next = vec![root];
-        while let Some(frame) = next.pop() {
-            let so_far: Option<Relative> = reached[&frame];
-            for (other, t_frame_other) in self.0.get(&frame).into_iter().flatten() {
-                if !reached.contains_key(other) {
-                    let t_root_other = so_far.map_or(*t_frame_other, |t| t.compose(t_frame_other));
-                    reached.insert(*other, Some(t_root_other));
-                    next.push(*other);
-                }
-            }
-        }
-        reached
-    }
+    forest
 }
 
 /// The frame-level consensus of one pair, in SE(3) or SIM(3) as its units ask.
