@@ -9,6 +9,7 @@ use merganser_protocol::agent::Core;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, JobId, Output, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
 use merganser_protocol::ids::{Hash, RobotId};
+use merganser_protocol::kinds::PairStatus;
 use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::submap::{Keyframe, Loss};
 use merganser_protocol::time::Instant;
@@ -284,6 +285,22 @@ fn tell(event: &Event) {
         Event::StoreHealed => warn!("the store works again; nothing was lost"),
         Event::Merged { frame } => info!(%frame, "merged"),
         Event::Unmerged { frame } => warn!(%frame, "no longer merged"),
+        Event::PairMoved { a, b, by } => warn!(a, b, by, "a merged pair moved by more than was claimed at 99.9 %"),
+        Event::PairUnmerged { a, b, status } => warn!(
+            a,
+            b,
+            now = status.map_or("without any alignment that counts", PairStatus::name),
+            "a merged pair is no longer merged"
+        ),
+        Event::PairsContradict { robots, certain: true } => warn!(
+            "what {} states contradicts what others measured of one another: nothing is merged with it",
+            robots.join(", ")
+        ),
+        Event::PairsContradict { robots, certain: false } => warn!(
+            "merged pairs contradict one another, and at least one of {} is wrong: nothing is merged on the strength of \
+             these pairs",
+            robots.join(", ")
+        ),
         Event::EpochBegan { frame, reason } => info!(%frame, reason = reason.text(), "a new epoch begins"),
         Event::Condensed { frame, parts, submaps_gone, bytes: [before, after] } => {
             info!(%frame, parts, submaps_gone, before, after, "log condensed");

@@ -111,6 +111,20 @@ pub struct FramesView {
     pub frames: Vec<FrameView>,
     /// Every pair of frames that has at least one alignment.
     pub pairs: Vec<PairView>,
+    /// Robots that may be wrong, and why.
+    #[serde(default)]
+    pub suspects: Vec<SuspectView>,
+}
+
+/// A robot that may be wrong.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SuspectView {
+    /// Its name.
+    pub robot: String,
+    /// What speaks against it, and what is done.
+    pub reason: String,
+    /// Nothing else explains that as well.
+    pub certain: bool,
 }
 
 /// One frame.
@@ -151,6 +165,9 @@ pub struct PairView {
     /// origins of the frames may be far away, and `t_a_b` as uncertain as the way to them.
     #[serde(default)]
     pub middle: Option<MiddleView>,
+    /// Of a pair that contradicts others: that it does, and who may be wrong. Empty else.
+    #[serde(default)]
+    pub reason: String,
 }
 
 /// How two anchors lie by the joint estimate.

@@ -9,11 +9,11 @@ use crate::telemetry;
 use anyhow::{Context, Result, anyhow};
 use console::{Term, measure_text_width, pad_str, style};
 use merganser_protocol::ids::Name;
-use merganser_protocol::snapshot::{FramesView, PairStatus, PairView, StatusView};
+use merganser_protocol::snapshot::{FramesView, PairStatus, PairView, StatusView, SuspectView};
 use merganser_protocol::wire::messages::Message;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -166,6 +166,7 @@ fn decode(bytes: &[u8]) -> Result<Value, String> {
 struct Seen {
     status: Option<(Instant, StatusView)>,
     pairs: Vec<PairView>,
+    suspects: Vec<SuspectView>,
 }
 
 /// Asks all robots for their views and shows a table, until `end`.
@@ -190,7 +191,8 @@ async fn tables(session: &Session, args: &WatchArgs, end: impl Future<Output = (
             robots.entry(robot).or_default().status = Some((Instant::now(), status));
         }
         for (robot, frames) in frames {
-            robots.entry(robot).or_default().pairs = frames.pairs;
+            let seen = robots.entry(robot).or_default();
+            (seen.pairs, seen.suspects) = (frames.pairs, frames.suspects);
         }
         let text = draw(&args.swarm, &robots);
         if term.is_term() {
@@ -278,7 +280,17 @@ fn draw(swarm: &Name, robots: &BTreeMap<Name, Seen>) -> String {
         rows.extend(pairs.into_values().map(pair_row));
         lay_out(&mut text, &rows);
     }
+    let suspects: BTreeSet<String> = robots.values().flat_map(|seen| &seen.suspects).map(suspect).collect();
+    for line in suspects {
+        let _ = writeln!(text, "{}", style(line).yellow()); // a String takes any text
+    }
     text
+}
+
+/// A robot that may be wrong, by what another says.
+fn suspect(suspect: &SuspectView) -> String {
+    let how = if suspect.certain { "is wrong" } else { "may be wrong" };
+    format!("{} {how}: {}", suspect.robot, suspect.reason)
 }
 
 /// Who makes which map of equal facts, if not all make the same.

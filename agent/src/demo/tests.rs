@@ -76,6 +76,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
         log10_nfa: Some(-20.0),
         t_a_b: Some(relation(t_a_b(a, b))),
         middle: None,
+        reason: String::new(),
     };
     let submap = |robot: usize, index: usize| {
         let (first, last) = (index * PER_SUBMAP, (index + 1) * PER_SUBMAP - 1);
@@ -125,6 +126,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
                 })
                 .collect(),
             pairs: vec![pair(0, 1), pair(0, 2), pair(1, 2)],
+            suspects: Vec::new(),
         },
         map: MapView { submaps: (0..3).flat_map(|r| (0..3).map(move |i| (r, i))).map(|(r, i)| submap(r, i)).collect() },
         path: path(tracks, own, |k| tracks[own].odometry[k]),

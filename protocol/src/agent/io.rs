@@ -2,6 +2,7 @@
 
 use super::job::{Job, JobResult};
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
+use crate::kinds::PairStatus;
 use crate::submap::stated::Oddity;
 use crate::submap::{Keyframe, Loss};
 use crate::time::Stamp;
@@ -333,6 +334,31 @@ pub enum Event {
     Unmerged {
         /// The frame.
         frame: FrameId,
+    },
+    /// Two merged frames lie elsewhere than was claimed, by more than the claim allowed in 99.9 of 100 cases.
+    PairMoved {
+        /// The first, `name/epoch`.
+        a: String,
+        /// The second.
+        b: String,
+        /// How far their origins moved, m (units of the first frame).
+        by: f64,
+    },
+    /// Two frames that were merged no longer are.
+    PairUnmerged {
+        /// The first, `name/epoch`.
+        a: String,
+        /// The second.
+        b: String,
+        /// What they are now; `None` if nothing between them counts any more.
+        status: Option<PairStatus>,
+    },
+    /// Merged pairs of frames contradict one another around a loop. Told once for each set of robots.
+    PairsContradict {
+        /// Names of the robots of which at least one is wrong.
+        robots: Vec<String>,
+        /// Nothing else explains it as well: all of these are wrong.
+        certain: bool,
     },
     /// Bad input was refused. Rate-limited: `suppressed` counts the like since the last report.
     Rejected {

@@ -348,7 +348,7 @@ impl Agent {
 
     /// Forgets and learns everything again: at start, and when a quarantine takes facts away.
     pub(super) fn relearn(&mut self) {
-        let calling = self.replication.relearn();
+        let calling = self.replication.relearn(self.context.robot());
         self.estimation.on_relearned();
         let sources = Sources::of(&self.replication, &self.estimation);
         self.alignment.on_relearned(&mut self.context, sources, &calling);

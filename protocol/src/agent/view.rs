@@ -4,15 +4,17 @@
 use super::Agent;
 use super::alignment::Sources;
 use super::estimation::{estimate_version, live_robots, pair_views, robot_view};
+use super::replication::copies::{CopiedFrom, Copies};
 use super::replication::knowledge::Agreement;
 use crate::estimate::EdgeKind;
+use crate::estimate::blame::Blame;
 use crate::estimate::joint::Shortfall;
 use crate::estimate::solve::ComponentError;
 use crate::geometry::Se3;
 use crate::ids::{EntryId, FrameId, RobotId};
 use crate::snapshot::{
     CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, MiddleView, PairView, PathView,
-    PoseView, PosesView, RelationView, Snapshot, StatsView, StatusView, SubmapView,
+    PoseView, PosesView, RelationView, Snapshot, StatsView, StatusView, SubmapView, SuspectView,
 };
 use crate::time::Instant;
 use crate::wire::fact::AlignmentFact;
@@ -111,7 +113,7 @@ impl Agent {
                 t_own_frame: self.estimation.t_own_frame(own, frame).as_ref().map(RelationView::from),
             })
             .collect();
-        FramesView { own: self.context.frame_name(own), frames, pairs: self.pair_views() }
+        FramesView { own: self.context.frame_name(own), frames, pairs: self.pair_views(), suspects: self.suspects() }
     }
 
     /// Numbers the components by their smallest frames; frames with one number are connected.
@@ -145,8 +147,42 @@ impl Agent {
                     j: self.context.submap_name(middle.j),
                     t_i_j: RelationView::from(&middle.t_i_j),
                 }),
+                reason: pair.blame.as_ref().map(|blame| self.why(blame)).unwrap_or_default(),
             })
             .collect()
+    }
+
+    fn why(&self, blame: &Blame) -> String {
+        let names: Vec<String> = blame.robots.iter().map(|robot| self.context.robot_name(*robot)).collect();
+        let names = names.join(", ");
+        if blame.certain {
+            format!("what {names} states contradicts what others measured of one another")
+        } else {
+            format!("pairs around a loop contradict one another, and at least one of {names} is wrong")
+        }
+    }
+
+    /// Robots that may be wrong: as pairs that contradict one another tell, and clouds that others stated before.
+    fn suspects(&self) -> Vec<SuspectView> {
+        let blames: BTreeSet<&Blame> =
+            self.estimation.solved().pairs.iter().filter_map(|pair| pair.blame.as_ref()).collect();
+        let contradicts = blames.into_iter().flat_map(|blame| {
+            let view = |robot: &RobotId| SuspectView {
+                robot: self.context.robot_name(*robot),
+                reason: self.why(blame),
+                certain: blame.certain,
+            };
+            blame.robots.iter().map(view).collect::<Vec<_>>()
+        });
+        let copies = self.replication.knowledge().copied().map(|(CopiedFrom { by, of }, count)| SuspectView {
+            robot: self.context.robot_name(by),
+            reason: format!(
+                "{count} of its submaps show what {} stated before as its own; nothing is aligned with them",
+                self.context.robot_name(of)
+            ),
+            certain: of == self.context.robot(),
+        });
+        contradicts.chain(copies).collect()
     }
 
     fn poses_view(&self, now: Instant) -> PosesView {
@@ -238,6 +274,7 @@ impl Agent {
     /// Alignments that did not enter the estimate, with the reason.
     fn unused_edges(&self, listed: &BTreeSet<EntryId>) -> Vec<EdgeView> {
         let unused = self.replication.knowledge().alignments().filter(|(id, _)| !listed.contains(id));
+        let copies = self.replication.knowledge().copies();
         unused
             .map(|(id, fact)| {
                 let agreement = self.replication.knowledge().agreement(id);
@@ -248,7 +285,7 @@ impl Agent {
                     t_i_j: RelationView::from(&fact.t_i_j),
                     agreed: agreement == Agreement::Agreed,
                     weight: 0.0,
-                    reason: self.reason_outside(id, fact, agreement),
+                    reason: self.reason_outside(id, fact, agreement, &copies),
                     contradicts: false,
                 }
             })
@@ -256,8 +293,11 @@ impl Agent {
     }
 
     /// Why an alignment is not among those that the estimate was made of.
-    fn reason_outside(&self, id: EntryId, fact: &AlignmentFact, agreement: Agreement) -> String {
+    fn reason_outside(&self, id: EntryId, fact: &AlignmentFact, agreement: Agreement, copies: &Copies) -> String {
         let is_of_present_facts = self.estimation.is_of(self.replication.digest());
+        if self.replication.knowledge().is_of_copy(copies, (fact.i, fact.j)) {
+            return "one of the two robots states as its own what the other's submap shows".to_string();
+        }
         match (agreement, self.replication.knowledge().counted((fact.i, fact.j))) {
             (Agreement::Waiting, _) => "the other endpoint has not answered".to_string(),
             (Agreement::Disputed, _) => "the other endpoint does not agree".to_string(),

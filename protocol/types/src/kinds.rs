@@ -43,8 +43,20 @@ pub enum PairStatus {
     /// Two rival groups of alignments; or about as many pairs of submaps that fit in several ways as hold, between the
     /// two or within either, so that the place repeats itself.
     Ambiguous,
-    /// Alignments contradict one another.
+    /// Alignments contradict one another, or other pairs.
     Inconsistent,
+}
+
+impl PairStatus {
+    /// As it is written.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Merged => "merged",
+            Self::Provisional => "provisional",
+            Self::Ambiguous => "ambiguous",
+            Self::Inconsistent => "inconsistent",
+        }
+    }
 }
 
 /// What is known about the optimality of an estimate.

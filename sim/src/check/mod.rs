@@ -216,8 +216,12 @@ pub(crate) mod tests {
             component: 0,
             t_own_frame: Some(t.clone()),
         };
-        let frames =
-            FramesView { own: format!("{name}/1"), frames: frames.iter().map(frame).collect(), pairs: Vec::new() };
+        let frames = FramesView {
+            own: format!("{name}/1"),
+            frames: frames.iter().map(frame).collect(),
+            pairs: Vec::new(),
+            suspects: Vec::new(),
+        };
         let snapshot = Snapshot {
             status,
             frames,

@@ -6,6 +6,7 @@ mod calibration;
 mod hostile;
 mod landmarks;
 mod laser;
+mod mirror;
 mod real_data;
 mod scales;
 mod swarm;

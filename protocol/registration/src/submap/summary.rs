@@ -147,6 +147,11 @@ impl Summary {
         Self { version, ..self }
     }
 
+    /// The shares, with neither the voxel nor what others add to them; `None` of an empty submap.
+    pub fn shares(&self) -> Option<&[u8]> {
+        (self.square > 0).then_some(&self.words)
+    }
+
     /// Whether a LiDAR saw the submap, which does not bend its views.
     pub fn is_of_ranges(&self) -> bool {
         self.version == RANGES

@@ -53,7 +53,8 @@ impl Alignment {
         let prospects = self.prospects(context, sources);
         let (mine, theirs) = prospects.ours_first(fact);
         let further = prospects.is_second_look(fact);
-        let Some(further) = further.filter(|_| self.negotiation.features(mine).is_some()) else {
+        let is_copy = sources.knowledge.copied_from(theirs).is_some();
+        let Some(further) = further.filter(|_| !is_copy && self.negotiation.features(mine).is_some()) else {
             self.negotiation.verify.remove(&id);
             return Some(verdict(id, VerdictOutcome::Refused(RefusalReason::BadInput)));
         };

@@ -96,7 +96,16 @@ impl Alignment {
         self.negotiation.mark_dirty();
         match fact {
             Fact::Submap(fact) => {
-                self.note_candidates(context, sources.knowledge, SubmapId { frame: id.frame, index: fact.index });
+                let new = SubmapId { frame: id.frame, index: fact.index };
+                if let Some(of) = sources.knowledge.copied_from(new) {
+                    let detail = format!(
+                        "{new} shows what {} stated before as its own; nothing is aligned with it. Do both play one \
+                         recording?",
+                        context.robot_name(of)
+                    );
+                    context.reject(Some(new.frame.robot), "copied_submap", &detail);
+                }
+                self.note_candidates(context, sources.knowledge, new);
             }
             Fact::Alignment(fact) => self.note_verification(context, sources, id, fact),
             Fact::Verdict(fact) => report_agreement(context, sources.knowledge, fact.alignment),

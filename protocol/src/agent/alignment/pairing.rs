@@ -55,6 +55,9 @@ impl Looks<'_> {
         let mut least = wanted(negotiation);
         for (theirs, known) in all {
             let Some(looks) = &known.summary else { continue };
+            if self.knowledge.copied_from(theirs).is_some() {
+                continue;
+            }
             for &(mine, summary) in ours {
                 let Some(similarity) = summary.similarity_from(looks, least) else { continue };
                 let pair = pair_of(mine, theirs);

@@ -1,6 +1,7 @@
 //! The joint estimate: when it is solved again, what changed when it was, and what it says. Its timer is that of the
 //! next solution.
 
+mod claims;
 pub mod estimate_version;
 mod live;
 mod steps;
@@ -17,6 +18,7 @@ use crate::estimate::verdicts::Verdicts;
 use crate::geometry::{PoseWithCovariance, Relative};
 use crate::ids::{FrameId, Hash, SubmapId};
 use crate::time::Instant;
+use claims::Claims;
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 use steps::Steps;
@@ -47,6 +49,8 @@ pub(super) struct Estimation {
     digest: Hash,
     next_solve: Instant,
     merged: BTreeSet<FrameId>,
+    /// What was said of pairs of frames.
+    claims: Claims,
     /// The odometry of the last problem posed.
     steps: Steps,
     /// What pairs of frames came to; with the job while one runs.
@@ -114,6 +118,10 @@ impl Estimation {
         }
         for frame in before.difference(&merged) {
             context.event(Event::Unmerged { frame: *frame });
+        }
+        for change in self.claims.renew(&self.solved.pairs) {
+            let event = change.event(context);
+            context.event(event);
         }
         true
     }

@@ -63,6 +63,7 @@ mod tests {
             keyframes: None,
             extent: [1.0; 3],
             blob: Hash::default(),
+            keypoints: 0,
             scale: ScaleKind::Metric,
             summary: None,
         }

@@ -1,6 +1,7 @@
 //! What the facts say, independent of the order they came in: the submaps, which alignments both endpoints agree on
 //! (the two-sided rule, DESIGN §3), and the estimation problem that follows from them.
 
+use super::copies::{CopiedFrom, Copies, FirstHeard};
 use crate::agent::two_sided;
 use crate::estimate::distortion::{COMMON_BENT, COMMON_LIDAR};
 use crate::estimate::joint::{AgreedAlignment, FrameChain, MapProblem};
@@ -54,6 +55,8 @@ pub struct Known {
     pub extent: [f32; 3],
     /// Address of the keypoint blob.
     pub blob: Hash,
+    /// How many keypoints that holds, by its owner's word.
+    pub keypoints: u16,
     /// Unit of the frame.
     pub scale: ScaleKind,
     /// How many keyframes made it, if that is told.
@@ -88,6 +91,7 @@ pub struct Knowledge {
     sightings: BTreeMap<EntryId, SightingFact>,
     positions: BTreeMap<EntryId, PositionFact>,
     lookalikes: BTreeMap<EntryId, LookalikeFact>,
+    first_heard: FirstHeard,
     /// Derived, kept because it is asked often: what [`Knowledge::judge`] says of each alignment.
     agreements: BTreeMap<EntryId, Agreement>,
 }
@@ -137,6 +141,7 @@ impl Knowledge {
         self.sightings.retain(|id, _| !gone(id));
         self.positions.retain(|id, _| !gone(id));
         self.lookalikes.retain(|id, _| !gone(id));
+        self.first_heard.prune(self.submaps.len(), self.submaps.values().map(|known| &**known));
         let entries = EntryId { frame, seq: 0 }..EntryId { frame, seq: floor };
         let alignments: Vec<EntryId> = self.alignments.range(entries).map(|(id, _)| *id).collect();
         for id in alignments {
@@ -171,12 +176,40 @@ impl Knowledge {
                 t_prev_this: fact.odometry.pose,
                 extent: fact.extent,
                 blob: fact.blob,
+                keypoints: fact.keypoint_count,
                 scale: fact.scale,
                 keyframes: fact.keyframes,
                 summary: Summary::decode(&fact.summary).ok(),
             };
+            self.first_heard.hear(submap.frame.robot, &known);
             self.submaps.insert(submap, Box::new(known));
         }
+    }
+
+    /// All facts came from the disk at once, and those of `me` count as heard before all.
+    pub fn order_by_stamp(&mut self, me: RobotId) {
+        self.first_heard = FirstHeard::by_stamp(me, self.submaps());
+    }
+
+    /// Another robot that stated before what this submap shows: the submap is a copy.
+    pub fn copied_from(&self, id: SubmapId) -> Option<RobotId> {
+        self.first_heard.before(id.frame.robot, self.submap(id)?)
+    }
+
+    /// Who states others' clouds as its own, whose, and of how many submaps.
+    pub fn copied(&self) -> impl Iterator<Item = (CopiedFrom, u64)> {
+        self.first_heard.copied()
+    }
+
+    /// What several robots state as their own, by all facts held.
+    pub fn copies(&self) -> Copies {
+        Copies::among(self.submaps())
+    }
+
+    /// Whether an alignment of two submaps says nothing, for one is a copy.
+    pub fn is_of_copy(&self, copies: &Copies, (i, j): Pair) -> bool {
+        let known = |id| self.submap(id).map(|known| (id, known));
+        known(i).zip(known(j)).is_some_and(|(i, j)| copies.void([i, j]))
     }
 
     fn absorb_alignment(&mut self, id: EntryId, fact: AlignmentFact) {
@@ -292,11 +325,15 @@ impl Knowledge {
             let point = SeenPoint { p_i, p_j, covariance: fact.covariance };
             Some(StatedPoint { entry: *entry, i: place(fact.i)?, j: place(fact.j)?, point })
         };
+        let copies = self.copies();
+        let counts = |pair: &Pair| {
+            let known = place(pair.0).is_some() && place(pair.1).is_some();
+            if known && !self.is_of_copy(&copies, *pair) { self.counted(*pair) } else { None }
+        };
         let agreed: Vec<(AgreedAlignment, f64)> = self
             .by_pair
-            .iter()
-            .filter(|((i, j), _)| place(*i).is_some() && place(*j).is_some())
-            .filter_map(|(pair, _)| self.counted(*pair))
+            .keys()
+            .filter_map(counts)
             .filter_map(|id| self.alignments.get(&id).map(|fact| (id, fact)))
             .filter_map(|(entry, fact)| {
                 let tie = tie(entry, fact.i, fact.j, self.measurement(entry, fact))?;

@@ -9,6 +9,7 @@ pub(super) mod blobs;
 mod condensing;
 #[cfg(test)]
 mod condensing_tests;
+pub(super) mod copies;
 mod gossip;
 pub(super) mod knowledge;
 mod ledger;
@@ -159,7 +160,7 @@ impl Replication {
 
     /// Forgets and learns everything again. Facts that call for something: of submaps ours call for all pairs, verdicts
     /// for nothing but news, and these are old.
-    pub(super) fn relearn(&mut self) -> Vec<(EntryId, Fact)> {
+    pub(super) fn relearn(&mut self, me: RobotId) -> Vec<(EntryId, Fact)> {
         self.knowledge = Knowledge::default();
         let mut calling = Vec::new();
         for (id, fact) in self.replica.facts() {
@@ -168,6 +169,7 @@ impl Replication {
             }
             self.knowledge.absorb(id, fact);
         }
+        self.knowledge.order_by_stamp(me);
         calling
     }
 

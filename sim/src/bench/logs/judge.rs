@@ -331,6 +331,7 @@ mod tests {
             log10_nfa: None,
             t_a_b: None,
             middle: Some(MiddleView { i: "a/0#0".into(), j: "b/0#0".into(), t_i_j: stated(off) }),
+            reason: String::new(),
         };
         Statement {
             at: Instant::ZERO.after(Duration::from_secs(secs)),
