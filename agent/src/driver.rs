@@ -301,6 +301,11 @@ fn tell(event: &Event) {
              these pairs",
             robots.join(", ")
         ),
+        Event::RobotDoesNotFit { robot, others } => warn!(
+            others,
+            "what {robot} states does not fit together as others see it: its odometry is wrong, or less certain than it \
+             says"
+        ),
         Event::EpochBegan { frame, reason } => info!(%frame, reason = reason.text(), "a new epoch begins"),
         Event::Condensed { frame, parts, submaps_gone, bytes: [before, after] } => {
             info!(%frame, parts, submaps_gone, before, after, "log condensed");

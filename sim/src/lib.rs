@@ -23,6 +23,7 @@
 //! # Ok(()) }
 //! ```
 
+pub mod adversary;
 pub mod band;
 pub mod bar;
 pub mod bench;

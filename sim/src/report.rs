@@ -78,6 +78,7 @@ pub struct Told {
 impl Report {
     /// The report of a run.
     pub fn of<C>(outcome: &Outcome<C>) -> Self {
+        let adversaries = outcome.scenario.adversaries();
         let sample = Sample {
             at: outcome.ended,
             phase: Phase::End,
@@ -85,6 +86,7 @@ impl Report {
             down: Vec::new(),
             truth: &outcome.truth,
             expect: &outcome.scenario.expect,
+            adversaries: &adversaries,
         };
         let frame_errors = frame_errors(&sample);
         let d2: Vec<f64> = frame_errors.iter().map(|e| e.d2).collect();

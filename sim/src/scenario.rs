@@ -1,6 +1,7 @@
 //! A scenario: robots, world, network, faults and what the run must show, from a TOML file. Everything has a default;
 //! unknown keys and impossible values are refused with the key's name and what to write instead.
 
+use crate::adversary::Adversary;
 use crate::faults::Fault;
 use crate::field::Layout;
 use crate::network::NetworkOptions;
@@ -12,6 +13,7 @@ use crate::world::sensor::SensorOptions;
 use merganser_protocol::config::{Config, ConfigError, Sensor};
 use merganser_protocol::wire::fact::ScaleKind;
 use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 
 /// Robots in one scenario at most.
@@ -113,6 +115,8 @@ pub struct SummaryOptions {
     pub solve: bool,
     /// Robots that state false alignments, each its own falsehood.
     pub liars: Vec<String>,
+    /// Robots that lie of themselves, and how.
+    pub adversaries: BTreeMap<String, Adversary>,
 }
 
 impl Default for SummaryOptions {
@@ -125,6 +129,7 @@ impl Default for SummaryOptions {
             refused_at_first: 0.0,
             solve: true,
             liars: Vec::new(),
+            adversaries: BTreeMap::new(),
         }
     }
 }
@@ -198,6 +203,16 @@ impl Scenario {
         (0..self.robots).map(name).collect()
     }
 
+    /// How this robot lies of itself, if it does.
+    pub fn adversary(&self, robot: &str) -> Option<Adversary> {
+        self.summary.as_ref()?.adversaries.get(robot).copied()
+    }
+
+    /// Robots that lie of themselves.
+    pub fn adversaries(&self) -> BTreeSet<String> {
+        self.summary.iter().flat_map(|summary| summary.adversaries.keys().cloned()).collect()
+    }
+
     /// The core's configuration on this robot.
     pub fn config_of(&self, robot: &str) -> Config {
         let mut config = self.config.clone();
@@ -226,6 +241,7 @@ impl Scenario {
             range("summary.common", summary.common, 0.0, 0.5, "use 0 to 0.5")?;
             range("summary.refused_at_first", summary.refused_at_first, 0.0, 1.0, "use 0 to 1")?;
             summary.liars.iter().try_for_each(|liar| self.validate_name("summary.liars", liar))?;
+            summary.adversaries.keys().try_for_each(|name| self.validate_name("summary.adversaries", name))?;
         }
         self.validate_landmarks()?;
         for (key, value, low, high, mend) in self.places.iter().flat_map(PlaceOptions::ranges) {

@@ -3,7 +3,8 @@
 
 use crate::check::{RobotSample, Sample};
 use merganser_protocol::geometry::{Covariance, Se3, Sim3, So3};
-use merganser_protocol::snapshot::{FrameView, PoseView, RelationView};
+use merganser_protocol::kinds::PairStatus;
+use merganser_protocol::snapshot::{FrameView, PairView, PoseView, RelationView};
 use nalgebra::{SMatrix, SVector};
 use serde::Serialize;
 
@@ -27,7 +28,8 @@ pub struct FrameError {
 }
 
 /// The errors of all frames that any robot has merged with its own, where the truth is known; of a liar's, not those of
-/// its own.
+/// its own. Where adversaries lie of themselves, the errors of what two honest robots measured of one another: of the
+/// place of an adversary, and of what hangs on it alone, nothing is promised.
 pub fn frame_errors(sample: &Sample<'_>) -> Vec<FrameError> {
     sample.robots.iter().flat_map(|robot| errors_of(robot, sample)).collect()
 }
@@ -37,7 +39,16 @@ fn errors_of(robot: &RobotSample, sample: &Sample<'_>) -> Vec<FrameError> {
     let own = &snapshot.frames.own;
     let Some(t_world_own) = sample.truth.get(own) else { return Vec::new() };
     let deceives_itself = |frame: &FrameView| robot.lies && frame.robot == snapshot.status.robot;
-    let others = snapshot.frames.frames.iter().filter(|frame| frame.frame != *own && !deceives_itself(frame));
+    let is_promised = |frame: &FrameView| {
+        let lies = |name: &String| sample.adversaries.contains(name);
+        let measured = |pair: &PairView| {
+            pair.status == PairStatus::Merged && [&pair.a, &pair.b].iter().all(|end| [own, &frame.frame].contains(end))
+        };
+        let is_honest = !lies(&snapshot.status.robot) && !lies(&frame.robot);
+        sample.adversaries.is_empty() || (is_honest && snapshot.frames.pairs.iter().any(measured))
+    };
+    let others = snapshot.frames.frames.iter();
+    let others = others.filter(|frame| frame.frame != *own && !deceives_itself(frame) && is_promised(frame));
     others
         .filter_map(|frame| {
             let relation = frame.t_own_frame.as_ref()?;

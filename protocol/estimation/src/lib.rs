@@ -38,6 +38,7 @@ pub mod joint_covariance;
 mod loops;
 pub mod marginals;
 mod minimise;
+pub mod misfits;
 pub mod node;
 mod odometry_correlation;
 pub mod optimality;

@@ -360,6 +360,14 @@ pub enum Event {
         /// Nothing else explains it as well: all of these are wrong.
         certain: bool,
     },
+    /// Alignments of a robot with several others, who agree among themselves, contradict one another: its odometry is
+    /// wrong, or far less certain than it says. Told once, until it fits again.
+    RobotDoesNotFit {
+        /// Its name.
+        robot: String,
+        /// How many others.
+        others: usize,
+    },
     /// Bad input was refused. Rate-limited: `suppressed` counts the like since the last report.
     Rejected {
         /// From whom, as far as known.

@@ -9,6 +9,7 @@ use super::replication::knowledge::Agreement;
 use crate::estimate::EdgeKind;
 use crate::estimate::blame::Blame;
 use crate::estimate::joint::Shortfall;
+use crate::estimate::misfits::misfits;
 use crate::estimate::solve::ComponentError;
 use crate::geometry::Se3;
 use crate::ids::{EntryId, FrameId, RobotId};
@@ -182,7 +183,15 @@ impl Agent {
             ),
             certain: of == self.context.robot(),
         });
-        contradicts.chain(copies).collect()
+        let odd = misfits(&self.estimation.solved().pairs).into_iter().map(|(robot, others)| SuspectView {
+            robot: self.context.robot_name(robot),
+            reason: format!(
+                "its alignments with {others} others, who agree among themselves, contradict one another: its odometry \
+                 is wrong, or less certain than it says"
+            ),
+            certain: false,
+        });
+        contradicts.chain(copies).chain(odd).collect()
     }
 
     fn poses_view(&self, now: Instant) -> PosesView {

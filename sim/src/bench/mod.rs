@@ -9,6 +9,7 @@ pub mod flood;
 pub mod frames;
 pub mod gossip;
 pub mod graph;
+pub mod liars;
 pub mod logs;
 pub mod mission;
 pub mod outliers;
@@ -70,6 +71,11 @@ pub enum Bench {
     /// Alignments are made up, and err as much as they say. Exit code 1 if a mean normalised error lies outside of 0.93
     /// to 1.07 times its degrees of freedom.
     Calibration(calibration::Calibration),
+    /// Members that lie of themselves, one to three of eight: what becomes of the honest, and who is named
+    ///
+    /// Each swarm runs without and with them. Exit code 1 if an honest pair is farther off than it says or parts in
+    /// silence, or an honest robot is named.
+    Liars(liars::Liars),
     /// Real logs, cut into robots and played through the cores: merges, errors, what was ever wrong, bytes and time
     ///
     /// Each set is played on perfect wires and on such that lose a fifth of all messages. Exit code 1 if a relation of
@@ -104,6 +110,7 @@ pub fn run(bench: Bench) -> anyhow::Result<bool> {
         Bench::Flood(options) => flood::run(&options),
         Bench::Mission(options) => mission::run(&options),
         Bench::Calibration(options) => calibration::run(&options),
+        Bench::Liars(options) => liars::run(&options),
         Bench::Logs(options) => logs::run(&options),
         Bench::Frames { seeds, first } => frames(first, seeds),
     }

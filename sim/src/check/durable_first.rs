@@ -29,6 +29,8 @@ struct Robot {
     /// Records the disk holds: one may be stored twice.
     durable: BTreeSet<Hash>,
     sent: VecDeque<Vec<u8>>,
+    /// Its blobs are others', who have stored them.
+    mirrors: bool,
 }
 
 impl Check for DurableFirst {
@@ -43,6 +45,7 @@ impl Check for DurableFirst {
                 state.waiting.clear();
                 state.sent.clear();
             }
+            Seen::Mirrors => state.mirrors = true,
             Seen::Wiped => state.durable.clear(),
             Seen::MayFork(origin) => {
                 self.doubted.insert(*origin);
@@ -59,7 +62,9 @@ impl Check for DurableFirst {
             }
             Seen::Output(Output::Persist { batch, records }) => {
                 let new = |bytes: &Vec<u8>| !state.durable.contains(&Hash::of(bytes));
-                let needles: Needles = records.iter().filter_map(|r| sendable(r, &self.doubted)).filter(new).collect();
+                let own = |record: &&Record| !(state.mirrors && matches!(record, Record::Blob { .. }));
+                let records = records.iter().filter(own);
+                let needles: Needles = records.filter_map(|r| sendable(r, &self.doubted)).filter(new).collect();
                 if let Some(needle) = state.sent.iter().find_map(|message| needles.within(message).next()) {
                     return Err(format!("robot {robot}: sent {} B before it stored them", needle.len()));
                 }
@@ -180,6 +185,20 @@ mod tests {
             }
             assert_eq!(check.see(0, &Seen::Output(&answer)).is_ok(), doubted == Some(origin), "{doubted:?}");
         }
+    }
+
+    /// Its own entries it stores first, like everybody.
+    #[test]
+    fn whoever_mirrors_others_clouds_may_pass_them_on_before_it_states_them() {
+        let mut check = DurableFirst::default();
+        check.see(0, &Seen::Mirrors).unwrap();
+        check.see(0, &Seen::Output(&publish())).unwrap();
+        assert!(check.see(0, &Seen::Output(&persist())).is_ok());
+        let Output::Persist { records, .. } = persist() else { panic!() };
+        let [Record::Blob { bytes, .. }] = &records[..] else { panic!() };
+        let id = EntryId { frame: FrameId { robot: RobotId([1; 8]), epoch: 1 }, seq: 0 };
+        let entry = Output::Persist { batch: 2, records: vec![Record::Entry { id, bytes: bytes.clone() }] };
+        assert!(check.see(0, &Seen::Output(&entry)).is_err());
     }
 
     #[test]

@@ -11,6 +11,7 @@ mod honest_covariance;
 mod merged_as_expected;
 mod never_back;
 mod no_false_merge;
+mod nobody_slandered;
 mod pending;
 mod same_estimate;
 mod same_facts;
@@ -24,7 +25,7 @@ use merganser_protocol::ids::{FrameId, Hash, RobotId};
 use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::time::Instant;
 use serde::Serialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// An invariant.
 pub trait Check {
@@ -69,6 +70,8 @@ pub enum Seen<'a> {
     Damaged,
     /// From now on there may be two histories of this robot's logs, by no fault of the core.
     MayFork(RobotId),
+    /// It restates clouds that it has from others, who hold them: of these it may send before it stored them.
+    Mirrors,
     /// From now on entries may come with this robot's signature that its core did not write: by a forger who has its
     /// key, or by a twin, who may even write the very same.
     Forges(RobotId),
@@ -100,6 +103,8 @@ pub struct Sample<'a> {
     pub truth: &'a BTreeMap<String, Sim3>,
     /// What the scenario asks for.
     pub expect: &'a Expect,
+    /// Names of members that lie of their own place, so that nothing is promised of it.
+    pub adversaries: &'a BTreeSet<String>,
 }
 
 /// One running robot.
@@ -150,6 +155,7 @@ impl Checks {
             Box::new(same_estimate::SameEstimate),
             Box::new(sound_numbers::SoundNumbers),
             Box::new(no_false_merge::NoFalseMerge),
+            Box::new(nobody_slandered::NobodySlandered),
             Box::new(honest_covariance::HonestCovariance),
             Box::<converged::Converged>::default(),
             Box::new(merged_as_expected::MergedAsExpected),
@@ -242,8 +248,10 @@ pub(crate) mod tests {
         }
     }
 
+    static NOBODY: BTreeSet<String> = BTreeSet::new();
+
     /// A last sample of these robots.
     pub fn sample<'a>(robots: Vec<RobotSample>, truth: &'a BTreeMap<String, Sim3>, expect: &'a Expect) -> Sample<'a> {
-        Sample { at: Instant::ZERO, phase: Phase::End, robots, down: Vec::new(), truth, expect }
+        Sample { at: Instant::ZERO, phase: Phase::End, robots, down: Vec::new(), truth, expect, adversaries: &NOBODY }
     }
 }

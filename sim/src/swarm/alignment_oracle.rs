@@ -2,13 +2,14 @@
 //! alignment is the truth about their clouds with noise, if they lie within reach, and the joint estimate may be left
 //! out.
 
+use crate::adversary::Adversary;
 use crate::dice::Dice;
 use crate::scenario::SummaryOptions;
 use merganser_protocol::agent::job::{AlignJob, Job, JobResult, Measured, NotAligned, SolveJob};
 use merganser_protocol::estimate::joint::MapProblem;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3};
 use merganser_protocol::ids::Hash;
-use merganser_protocol::submap::Submap;
+use merganser_protocol::submap::{Described, Submap};
 use merganser_protocol::wire::fact::RefusalReason;
 use nalgebra::{Matrix6, Vector6};
 use std::collections::BTreeMap;
@@ -20,6 +21,10 @@ pub struct AlignmentOracle {
     seed: u64,
     /// By the hash of features and of keypoints.
     places: BTreeMap<Hash, Place>,
+    /// The last submap that an honest robot described, for mirrors.
+    shown: Option<Described>,
+    /// How many submaps each shifter described.
+    shifted: BTreeMap<String, u32>,
 }
 
 /// Where a submap's cloud truly lies, and what all its alignments err by alike, in standard deviations of one.
@@ -28,12 +33,14 @@ struct Place {
     features: Hash,
     t_world_anchor: Se3,
     bent: Vector6<f64>,
+    /// Of whom, if its owner colludes.
+    colludes: Option<Hash>,
 }
 
 impl AlignmentOracle {
     /// Knows nothing yet.
     pub fn new(options: SummaryOptions, seed: u64) -> Self {
-        Self { options, seed, places: BTreeMap::new() }
+        Self { options, seed, places: BTreeMap::new(), shown: None, shifted: BTreeMap::new() }
     }
 
     /// Does a job of the robot called `name`. `locate` says where a submap's cloud truly lies. Returns whether it lied.
@@ -41,18 +48,9 @@ impl AlignmentOracle {
         match job {
             Job::Describe(job) => {
                 let t_world_anchor = locate(&job.submap);
-                let result = Job::Describe(job).run();
-                if let (JobResult::Described(described), Some(t_world_anchor)) = (&result, t_world_anchor) {
-                    let features = Hash::of(&described.1.features.encode());
-                    let mut dice = Dice::new(self.seed, &format!("bent {features}"));
-                    let place = Place { features, t_world_anchor, bent: Vector6::from_fn(|_, _| dice.normal()) };
-                    self.places.insert(features, place);
-                    let first = &described.1.keypoints;
-                    let both = described.1.further.as_ref().and_then(|further| first.with_further(further));
-                    self.places.insert(Hash::of(&first.encode()), place);
-                    both.map(|both| self.places.insert(Hash::of(&both.encode()), place));
-                }
-                (result, false)
+                let mut result = Job::Describe(job).run();
+                let lied = self.describe(name, &mut result, t_world_anchor);
+                (result, lied)
             }
             Job::Align(job) => {
                 let lies = self.options.liars.iter().any(|liar| liar == name);
@@ -66,6 +64,48 @@ impl AlignmentOracle {
         }
     }
 
+    /// Notes where a submap that was described truly lies, as far as its owner does not lie of it. Whether it does.
+    fn describe(&mut self, name: &str, result: &mut JobResult, t_world_anchor: Option<Se3>) -> bool {
+        let adversary = self.options.adversaries.get(name).copied();
+        let JobResult::Described(described) = result else { return false };
+        match (adversary, &self.shown) {
+            (Some(Adversary::Mirror), Some(shown)) => {
+                described.1 = shown.clone();
+                return true;
+            }
+            (None, _) => self.shown = Some(described.1.clone()),
+            _ => {}
+        }
+        let Some(mut t_world_anchor) = t_world_anchor else { return false };
+        if let Some(step) = adversary.map(Adversary::shift_m).filter(|step| *step > 0.0) {
+            let count = self.shifted.entry(name.to_owned()).or_default();
+            *count += 1;
+            t_world_anchor = t_world_anchor * Se3::exp(&(Vector6::x() * step * f64::from(*count)));
+        }
+        let features = Hash::of(&described.1.features.encode());
+        let mut dice = Dice::new(self.seed, &format!("bent {features}"));
+        let colludes = (adversary == Some(Adversary::Colluder)).then(|| Hash::of(name.as_bytes()));
+        let place = Place { features, t_world_anchor, bent: Vector6::from_fn(|_, _| dice.normal()), colludes };
+        self.places.insert(features, place);
+        let first = &described.1.keypoints;
+        let both = described.1.further.as_ref().and_then(|further| first.with_further(further));
+        self.places.insert(Hash::of(&first.encode()), place);
+        both.map(|both| self.places.insert(Hash::of(&both.encode()), place));
+        adversary.is_some_and(|adversary| adversary.shift_m() > 0.0)
+    }
+
+    /// By what two that collude say that the world of the other lies beside one's own.
+    fn collusion(&self, mine: &Place, theirs: &Place) -> Se3 {
+        let Some((me, other)) = mine.colludes.zip(theirs.colludes).filter(|(me, other)| me != other) else {
+            return Se3::identity();
+        };
+        let (first, second) = (me.min(other), me.max(other));
+        let mut dice = Dice::new(self.seed, &format!("collusion {first} {second}"));
+        let falsehood =
+            Se3::exp(&Vector6::from([4.0, 4.0, 0.0, 0.0, 0.0, 1.5].map(|size| size * dice.range(0.5, 1.0))));
+        if me == first { falsehood } else { falsehood.inverse() }
+    }
+
     fn align(&self, name: &str, lies: bool, job: &AlignJob) -> Result<Measured, RefusalReason> {
         // Nothing tells one submap without keypoints from another, here or anywhere.
         if job.theirs.is_empty() || job.mine.is_empty() {
@@ -73,7 +113,7 @@ impl AlignmentOracle {
         }
         let theirs = self.places.get(&Hash::of(&job.theirs.encode())).ok_or(RefusalReason::BadInput)?;
         let mine = self.places.get(&Hash::of(&job.mine.encode())).ok_or(RefusalReason::BadInput)?;
-        let truth = mine.t_world_anchor.inverse() * theirs.t_world_anchor;
+        let truth = mine.t_world_anchor.inverse() * self.collusion(mine, theirs) * theirs.t_world_anchor;
         if truth.translation.norm() > self.options.reach_m {
             return Err(RefusalReason::NoConsensus);
         }

@@ -2,6 +2,7 @@
 
 use super::robot::{NewFrame, Robot};
 use super::{Event, Swarm, SwarmError, secs};
+use crate::adversary::Adversary;
 use crate::check::Seen;
 use crate::core::Restartable;
 use crate::dice::Dice;
@@ -57,6 +58,9 @@ impl<C: Restartable> Swarm<C> {
         }
         let id = self.robots[index].id;
         self.see(index, &Seen::Started(id));
+        if self.scenario.adversary(self.robots[index].name.as_str()) == Some(Adversary::Mirror) {
+            self.see(index, &Seen::Mirrors);
+        }
         self.counts.restarted += u64::from(incarnation > 1);
         self.drain(now, index);
         self.tell_of_new_frame(now, index);

@@ -69,7 +69,8 @@ impl<C: Restartable> Swarm<C> {
         let done = self.healed && down.is_empty() && all_done(&robots);
         self.done_samples = if done { self.done_samples + 1 } else { 0 };
         let phase = if self.healed { Phase::Calm } else { Phase::Storm };
-        let sample = Sample { at: now, phase, robots, down, truth: &self.truth, expect };
+        let sample =
+            Sample { at: now, phase, robots, down, truth: &self.truth, expect, adversaries: &self.adversaries };
         let (checks, stopwatch) = (&mut self.checks, &mut self.stopwatch);
         if let Some(violation) = stopwatch.time("check", || checks.sample(now, &sample)) {
             self.violation.get_or_insert(violation);

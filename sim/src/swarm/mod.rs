@@ -34,7 +34,7 @@ use merganser_protocol::geometry::Sim3;
 use merganser_protocol::ids::{NameError, RobotId};
 use merganser_protocol::time::Instant;
 use robot::{Robot, Slam, identities};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 use trace::Trace;
 
@@ -75,6 +75,7 @@ pub struct Swarm<C> {
     trace: Trace,
     counts: FaultCounts,
     truth: BTreeMap<String, Sim3>,
+    adversaries: BTreeSet<String>,
     told: Vec<(f64, usize, Told)>,
     stopwatch: Stopwatch,
     violation: Option<Violation>,
@@ -156,7 +157,7 @@ impl<C: Restartable> Swarm<C> {
         let mut robots = Vec::new();
         for (index, (identity, id)) in identities(&stage, seed)?.into_iter().enumerate() {
             let offset = scenario.machine.clock_offset_secs;
-            let slam = Slam::new(dice.range(-offset, offset));
+            let slam = Slam::new(dice.range(-offset, offset), scenario.adversary(identity.name.as_str()));
             let starts = millis(1e3 * dice.range(0.0, scenario.machine.start_within_secs));
             robots.push(Robot::new(identity, id, slam, &scenario));
             queue.push(Instant::ZERO.after(starts), Event::Boot { robot: index });
@@ -187,6 +188,7 @@ impl<C: Restartable> Swarm<C> {
             field,
             network: Network::new(scenario.network.clone(), robots.len(), seed),
             ids: robots.iter().take(members).enumerate().map(|(index, robot)| (robot.id, index)).collect(),
+            adversaries: scenario.adversaries(),
             oracle: scenario.summary.clone().map(|options| AlignmentOracle::new(options, seed)),
             scenario,
             stage,
@@ -262,6 +264,7 @@ impl<C: Restartable> Swarm<C> {
                 down: self.down(),
                 truth: &self.truth,
                 expect: &self.scenario.expect,
+                adversaries: &self.adversaries,
             };
             self.violation = self.checks.sample(ended, &sample);
         }

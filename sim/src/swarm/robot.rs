@@ -1,6 +1,7 @@
 //! One robot of a run: its key, its process (if it runs), its disk, its SLAM and what its shell remembers.
 
 use super::store::Store;
+use crate::adversary::Adversary;
 use crate::network::millis;
 use crate::scenario::{MachineOptions, Scenario};
 use crate::stage::Stage;
@@ -218,12 +219,13 @@ pub(super) struct Slam {
     restart: bool,
     /// Motion since the last keyframe that the agent took.
     motion: Option<PoseWithCovariance>,
+    adversary: Option<Adversary>,
 }
 
 impl Slam {
-    pub fn new(offset_secs: f64) -> Self {
+    pub fn new(offset_secs: f64, adversary: Option<Adversary>) -> Self {
         let stamp_offset = FIRST_STAMP_NS + (offset_secs * 1e9) as i64;
-        Self { stamp_offset, stamps: BTreeMap::new(), frames: Vec::new(), restart: false, motion: None }
+        Self { stamp_offset, stamps: BTreeMap::new(), frames: Vec::new(), restart: false, motion: None, adversary }
     }
 
     /// Time since the drive began, ns, of the keyframe with the nearest stamp.
@@ -253,7 +255,10 @@ impl Slam {
     /// Odometry of the body at `step`, in the frame of that time.
     pub fn t_frame_body(&self, step: &Step) -> Se3 {
         let begun = self.frames.iter().rev().find(|(nanos, _)| *nanos <= step.nanos);
-        begun.map_or(step.t_frame_body, |(_, t_drive_frame)| t_drive_frame.inverse() * step.t_frame_body)
+        let true_one =
+            begun.map_or(step.t_frame_body, |(_, t_drive_frame)| t_drive_frame.inverse() * step.t_frame_body);
+        let stretch = self.adversary.map_or(1.0, Adversary::stretch);
+        Se3::new(true_one.rotation, true_one.translation * stretch)
     }
 
     /// Where the frame of that time lies, by this step, if its unit is `unit_m`.
@@ -276,12 +281,13 @@ impl Slam {
             motion.covariance = Covariance::from_sigmas([FIRST_SIGMA; 6])?;
         }
         let pose = self.t_frame_body(step);
+        let claims = self.adversary.map_or(1.0, Adversary::claims);
         let stamp = self.stamp_offset.saturating_add_unsigned(step.nanos);
         self.stamps.insert(stamp, step.nanos);
         let (points, marks) = seen;
         Ok(Keyframe {
             stamp: Stamp(stamp),
-            pose: PoseWithCovariance { pose, covariance: motion.covariance },
+            pose: PoseWithCovariance { pose, covariance: motion.covariance.scaled(claims) },
             covariance_of: CovarianceOf::Motion,
             session: None,
             points,
@@ -335,7 +341,7 @@ mod tests {
 
     #[test]
     fn a_keyframe_answers_for_the_motion_of_those_that_were_missed() {
-        let mut slam = Slam::new(-5.5);
+        let mut slam = Slam::new(-5.5, None);
         let one = slam.keyframe(&step(1), Sightings::default()).unwrap();
         slam.skip(&step(2));
         slam.skip(&step(3));
@@ -350,7 +356,7 @@ mod tests {
 
     #[test]
     fn a_restarted_slam_begins_at_the_identity() {
-        let mut slam = Slam::new(0.0);
+        let mut slam = Slam::new(0.0, None);
         slam.keyframe(&step(1), Sightings::default()).unwrap();
         slam.restart();
         assert_eq!(slam.keyframe(&step(2), Sightings::default()).unwrap().pose.pose, Se3::identity());

@@ -1,6 +1,7 @@
 //! Drawing a run from a seed. Each part has its own stream of dice, so that a change in one leaves the others as they
 //! were.
 
+use crate::adversary::Adversary;
 use crate::dice::Dice;
 use crate::faults::Fault;
 use crate::field::Layout;
@@ -9,6 +10,7 @@ use crate::scenario::{Expect, MachineOptions, Scenario, SummaryOptions};
 use crate::world::WorldOptions;
 use crate::world::drive::DriveOptions;
 use merganser_protocol::config::Config;
+use std::collections::BTreeMap;
 
 /// The stated bound: within this time of the healing, all hold the same facts, virtual s...
 const SETTLE_SECS: f64 = 60.0;
@@ -75,8 +77,10 @@ pub fn draw(seed: u64, robots: Option<usize>) -> Scenario {
         faults: Vec::new(),
     };
     scenario.machine.start_within_secs = scenario.machine.start_within_secs.min(0.3 * duration_secs);
-    let liars = if solve { liars(&scenario, &mut dice) } else { Vec::new() };
-    let summary = SummaryOptions { solve, liars, refused_at_first: REFUSED_AT_FIRST, ..SummaryOptions::default() };
+    let mut liars = if solve { liars(&scenario, &mut dice) } else { Vec::new() };
+    let adversaries = adversaries(&mut liars, &mut Dice::new(seed, "vopr adversaries"));
+    let summary =
+        SummaryOptions { solve, liars, adversaries, refused_at_first: REFUSED_AT_FIRST, ..SummaryOptions::default() };
     scenario.summary = Some(summary);
     let split_secs = split_secs(robots, &mut Dice::new(seed, "vopr long"));
     if let Some(split_secs) = split_secs {
@@ -187,6 +191,16 @@ fn config(robots: usize, dice: &mut Dice) -> Config {
 fn liars(scenario: &Scenario, dice: &mut Dice) -> Vec<String> {
     let count = (dice.bits() as usize % 4).min(scenario.robots / 3);
     scenario.names().into_iter().rev().take(count).collect()
+}
+
+/// In half of the runs with liars, each of them lies of itself instead, in a way of its own; in a quarter, all collude.
+fn adversaries(liars: &mut Vec<String>, dice: &mut Dice) -> BTreeMap<String, Adversary> {
+    let way = |dice: &mut Dice| Adversary::ALL[dice.bits() as usize % Adversary::ALL.len()];
+    match dice.bits() % 4 {
+        0 => BTreeMap::new(),
+        1 => core::mem::take(liars).into_iter().map(|name| (name, Adversary::Colluder)).collect(),
+        _ => core::mem::take(liars).into_iter().map(|name| (name, way(dice))).collect(),
+    }
 }
 
 /// Draws faults, one group after another, each with its share of the runs.
@@ -448,6 +462,10 @@ mod tests {
             .map(|fault| format!("{fault:?}").split(' ').next().unwrap().to_owned())
             .collect();
         assert_eq!(drawn.len(), 19, "every variant of `Fault`: {drawn:?}");
-        assert!((0..100).any(|seed| !draw(seed, None).summary.unwrap().liars.is_empty()));
+        let summaries: Vec<SummaryOptions> = (0..500).filter_map(|seed| draw(seed, None).summary).collect();
+        assert!(summaries.iter().any(|summary| !summary.liars.is_empty()));
+        for way in Adversary::ALL {
+            assert!(summaries.iter().any(|summary| summary.adversaries.values().any(|one| *one == way)), "{way:?}");
+        }
     }
 }

@@ -99,8 +99,9 @@ impl Alignment {
                 let new = SubmapId { frame: id.frame, index: fact.index };
                 if let Some(of) = sources.knowledge.copied_from(new) {
                     let detail = format!(
-                        "{new} shows what {} stated before as its own; nothing is aligned with it. Do both play one \
+                        "{} shows what {} stated before as its own; nothing is aligned with it. Do both play one \
                          recording?",
+                        context.submap_name(new),
                         context.robot_name(of)
                     );
                     context.reject(Some(new.frame.robot), "copied_submap", &detail);

@@ -5,8 +5,9 @@ use crate::agent::context::Context;
 use crate::agent::io::Event;
 use crate::estimate::PairEstimate;
 use crate::estimate::blame::Blame;
+use crate::estimate::misfits::misfits;
 use crate::geometry::{Relative, chi2};
-use crate::ids::FrameId;
+use crate::ids::{FrameId, RobotId};
 use crate::kinds::PairStatus;
 use std::collections::BTreeMap;
 
@@ -19,6 +20,7 @@ const TIGHTER: f64 = 0.7;
 pub(super) struct Claims {
     merged: BTreeMap<(FrameId, FrameId), Relative>,
     blames: Vec<Blame>,
+    misfits: BTreeMap<RobotId, usize>,
 }
 
 /// What became of a claim.
@@ -30,6 +32,8 @@ pub(super) enum Change {
     Unmerged(FrameId, FrameId, Option<PairStatus>),
     /// Pairs contradict one another that did not, or others may be to blame.
     Contradict(Blame),
+    /// What a robot states does not fit together as so many others see it.
+    Misfit(RobotId, usize),
 }
 
 impl Claims {
@@ -54,6 +58,10 @@ impl Claims {
         blames.dedup();
         changes.extend(blames.iter().filter(|blame| !self.blames.contains(blame)).cloned().map(Change::Contradict));
         self.blames = blames;
+        let misfits = misfits(pairs);
+        let new = misfits.iter().filter(|(robot, _)| !self.misfits.contains_key(robot));
+        changes.extend(new.map(|(robot, others)| Change::Misfit(*robot, *others)));
+        self.misfits = misfits;
         changes
     }
 }
@@ -66,6 +74,7 @@ impl Change {
             Self::Unmerged(a, b, status) => {
                 Event::PairUnmerged { a: context.frame_name(a), b: context.frame_name(b), status }
             }
+            Self::Misfit(robot, others) => Event::RobotDoesNotFit { robot: context.robot_name(robot), others },
             Self::Contradict(blame) => Event::PairsContradict {
                 robots: blame.robots.iter().map(|robot| context.robot_name(*robot)).collect(),
                 certain: blame.certain,

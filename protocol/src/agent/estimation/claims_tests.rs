@@ -66,3 +66,16 @@ fn whom_contradictions_are_due_to_is_told_once() {
     assert_eq!(claims.renew(&[blamed(&[0, 1, 2])]), [Change::Contradict(blame(&[0, 1, 2]))]);
     assert!(claims.renew(&[]).is_empty());
 }
+
+#[test]
+fn who_does_not_fit_is_told_once() {
+    let all = |odd: bool| -> Vec<PairEstimate> {
+        let pairs = (0..4).flat_map(|a| (a + 1..4).map(move |b| (a, b)));
+        let status = |a| if a == 0 && odd { PairStatus::Inconsistent } else { PairStatus::Merged };
+        pairs.map(|(a, b)| PairEstimate { a: frame(a), b: frame(b), ..pair(status(a), 0.0, 0.1) }).collect()
+    };
+    let mut claims = Claims::default();
+    assert_eq!(claims.renew(&all(true)), [Change::Misfit(frame(0).robot, 3)]);
+    assert!(claims.renew(&all(true)).is_empty() && claims.renew(&all(false)).is_empty());
+    assert!(claims.renew(&all(true)).contains(&Change::Misfit(frame(0).robot, 3)));
+}
