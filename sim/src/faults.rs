@@ -368,7 +368,7 @@ pub struct FaultCounts {
     pub mangled: u64,
     /// Old messages delivered once more.
     pub replayed: u64,
-    /// False alignments computed by a liar.
+    /// False alignments computed by a liar, and submaps of members that lie of themselves.
     pub lies: u64,
     /// Logs found with two histories, over all robots.
     pub forks: u64,

