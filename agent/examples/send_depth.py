@@ -1,5 +1,5 @@
 """Feeds depth images to the agent on this host, as a SLAM with a depth camera would. Needs: pip install eclipse-zenoh
-Usage: python send_depth.py ENDPOINT SWARM ROBOT FOLDER, e.g. tcp/127.0.0.1:7447 demo alpha rgbd_7scenes; the folder
+Usage: python send_depth.py ENDPOINT SWARM ROBOT FOLDER, e.g. tcp/127.0.0.1:7448 demo alpha rgbd_7scenes; the folder
 holds frame-XXXXXX.depth.png in millimetres, camera-intrinsics.txt and poses_all_1000.txt (camera-to-world)."""
 import base64, json, math, pathlib, sys, time, zenoh
 
@@ -19,6 +19,7 @@ def quaternion(m):
 variances = [1e-4] * 3 + [3e-6] * 3  # of the motion since the keyframe before: 1 cm and 0.1 degrees
 covariance = [variances[r] if r == c else 0.0 for r in range(6) for c in range(r, 6)]
 config = zenoh.Config()
+config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([endpoint]))
 with zenoh.open(config) as session:
     time.sleep(1.0)  # until the link is up

@@ -22,6 +22,11 @@ const INPUT_BYTES_MAX: usize = 6 << 20;
 /// Largest message bound accepted; the largest answer a peer gives is far below it.
 const MESSAGE_BYTES_MAX: usize = 16 << 20;
 
+/// Where the robot's own SLAM connects if nothing else is said: the port after Zenoh's own.
+pub const DOOR_PORT: u16 = 7448;
+/// What the loopback interface is called on Linux and on BSD.
+const LOOPBACKS: [&str; 2] = ["lo", "lo0"];
+
 /// Everything that an agent reads from its configuration file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -126,7 +131,15 @@ pub struct ZenohConfig {
     /// Interface for multicast scouting, or `auto`: every one that has an IPv4 address. An agent that names no peers in
     /// `connect` ends, to be started again, when one of them gets another address.
     pub interface: String,
-    /// Interfaces over which `…/in/*` is accepted: this host's loopbacks, unless the SLAM runs on another computer.
+    /// Endpoints at which the robot's own SLAM sends `…/in/*` and reads views, by a session that looks for nobody.
+    /// Absent: `tcp/127.0.0.1:7448`, or the next free port; none if the session of the robots never leaves this host
+    /// ([`stays_on_this_host`](Self::stays_on_this_host)), which then takes input itself.
+    pub input_listen: Option<Vec<String>>,
+    /// Lines of `user:password`; whoever connects to `input_listen` must show one of them. Relative to the
+    /// configuration file's folder. Needed unless all of `input_listen` is loopback.
+    pub input_users_file: Option<PathBuf>,
+    /// Interfaces over which the session of the robots takes `…/in/*`, too. Whoever reaches a Zenoh peer or router on
+    /// this host can then feed the robot. What comes over others is dropped by Zenoh, without a word.
     pub input_interfaces: Vec<String>,
     /// Silence after which a link counts as lost. A partition shorter than this loses no message.
     pub lease_secs: f64,
@@ -149,7 +162,9 @@ impl Default for ZenohConfig {
             multicast: true,
             gossip: true,
             interface: "auto".into(),
-            input_interfaces: vec!["lo".into(), "lo0".into()],
+            input_listen: None,
+            input_users_file: None,
+            input_interfaces: Vec::new(),
             lease_secs: 10.0,
             message_bytes_max: 1 << 20,
             input_bytes_max: INPUT_BYTES_MAX,
@@ -182,11 +197,15 @@ pub struct DebugConfig {
     pub publish: bool,
     /// Shortest time between two publications of a view.
     pub interval_secs: f64,
+    /// Bytes a second of views that may go to the network of the robots, asked for or published: half of them for `map`,
+    /// `path` and `graph`, half for the others. What a view takes beyond it is made up for before the next. Where the robot's
+    /// own SLAM connects, and in a swarm that never leaves its host, nothing is held back.
+    pub bytes_per_sec: f64,
 }
 
 impl Default for DebugConfig {
     fn default() -> Self {
-        Self { publish: true, interval_secs: 0.5 }
+        Self { publish: true, interval_secs: 0.5, bytes_per_sec: 262_144.0 }
     }
 }
 
@@ -280,6 +299,7 @@ impl FileConfig {
         let folder = path.parent().unwrap_or(Path::new("."));
         config.key_file = folder.join(&config.key_file);
         config.store.path = folder.join(&config.store.path);
+        config.zenoh.input_users_file = config.zenoh.input_users_file.map(|file| folder.join(file));
         Ok(config)
     }
 
@@ -328,6 +348,7 @@ impl FileConfig {
         within("driver.jobs", d.jobs as f64, 1.0, 64.0, "use 1 to 64")?;
         within("store.commit_ms", s.commit_ms as f64, 0.0, 100.0, "use 0 to 100 ms")?;
         within("debug.interval_secs", v.interval_secs, 0.05, 3600.0, "use 0.05 to 3600 s")?;
+        within("debug.bytes_per_sec", v.bytes_per_sec, 1e3, 1e9, "use 1000 to 1000000000 bytes a second")?;
         if let Err(error) = self.log.filter.parse::<tracing_subscriber::EnvFilter>() {
             return Err(ValueError { key: "log.filter".into(), mend: format!("{error}; write e.g. \"info\"") });
         }
@@ -372,11 +393,10 @@ impl ZenohConfig {
         within("zenoh.input_bytes_max", self.input_bytes_max as f64, low, high, "use 65536 to 16777216 bytes")?;
         within("zenoh.lease_secs", self.lease_secs, 0.5, 600.0, "use 0.5 to 600 s")?;
         within("zenoh.close_secs", self.close_secs, 0.1, 60.0, "use 0.1 to 60 s")?;
-        if self.input_interfaces.is_empty() {
-            let mend = "name at least one interface, e.g. \"lo\"".into();
-            return Err(ValueError { key: "zenoh.input_interfaces".into(), mend });
-        }
-        for (key, list) in [("zenoh.listen", &self.listen), ("zenoh.connect", &self.connect)] {
+        let inputs = self.input_listen.as_deref().unwrap_or_default();
+        for (key, list) in
+            [("zenoh.listen", &self.listen[..]), ("zenoh.connect", &self.connect), ("zenoh.input_listen", inputs)]
+        {
             for text in list {
                 if let Err(error) = text.parse::<zenoh::config::EndPoint>() {
                     let error = in_words(error);
@@ -390,12 +410,63 @@ impl ZenohConfig {
                 }
             }
         }
+        self.validate_inputs()?;
         if self.mode == Mode::Client && self.connect.is_empty() && !self.multicast {
             let mend = "a client needs an endpoint to connect to, or multicast".into();
             return Err(ValueError { key: "zenoh.connect".into(), mend });
         }
         Ok(())
     }
+
+    fn validate_inputs(&self) -> Result<(), ValueError> {
+        let Some(inputs) = &self.input_listen else { return Ok(()) };
+        let refuse = |mend: String| Err(ValueError { key: "zenoh.input_listen".into(), mend });
+        if inputs.is_empty() {
+            return refuse("name at least one endpoint, e.g. \"tcp/127.0.0.1:7448\", or leave it out".into());
+        }
+        for endpoint in inputs {
+            if endpoint.ends_with(":0") {
+                return refuse(format!(
+                    "{endpoint:?} is another port at each start, which no SLAM can know; choose one"
+                ));
+            }
+            if self.listen.contains(endpoint) {
+                return refuse(format!("{endpoint:?} is in zenoh.listen, too; choose another port"));
+            }
+            if !is_loopback(endpoint) && self.input_users_file.is_none() {
+                return refuse(format!(
+                    "{endpoint:?} is open to others than this host: name a file with a line \"user:password\" in \
+                     zenoh.input_users_file, or listen on 127.0.0.1"
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether the session of the robots has its endpoints on this host's loopback alone, and does not look for others:
+    /// a swarm on one computer, as in simulations and tests.
+    pub fn stays_on_this_host(&self) -> bool {
+        let all = [&self.listen, &self.connect];
+        !self.multicast
+            && self.mode != Mode::Client
+            && !self.listen.is_empty()
+            && all.into_iter().flatten().all(|endpoint| is_loopback(endpoint))
+    }
+
+    /// Interfaces over which the session of the robots takes input.
+    pub fn feeding_interfaces(&self) -> Vec<String> {
+        if self.input_interfaces.is_empty() && self.input_listen.is_none() && self.stays_on_this_host() {
+            return LOOPBACKS.map(Into::into).to_vec();
+        }
+        self.input_interfaces.clone()
+    }
+}
+
+/// Whether an endpoint like `tcp/127.0.0.1:7447` is on this host's loopback.
+fn is_loopback(endpoint: &str) -> bool {
+    let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
+    let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+    host == "localhost" || host.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
 fn within(key: &str, value: f64, low: f64, high: f64, mend: &str) -> Result<(), ValueError> {

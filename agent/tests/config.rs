@@ -47,6 +47,21 @@ fn each_mistake_gets_one_error_that_names_its_line() {
         (text("alpha", KEY, "[zenoh]\ninput_bytes_max = 65535"), &["zenoh.input_bytes_max", "65536 to 16777216 bytes"]),
         (text("alpha", KEY, "[zenoh]\ninput_bytes_max = 16777217"), &["a.toml:7", "zenoh.input_bytes_max"]),
         (text("alpha", KEY, "[zenoh]\nconnect = [\"7447\"]"), &["a.toml:7", "zenoh.connect", "no endpoint"]),
+        (text("alpha", KEY, "[zenoh]\ninput_listen = []"), &["a.toml:7", "zenoh.input_listen", "at least one"]),
+        (text("alpha", KEY, "[zenoh]\ninput_listen = [\"7448\"]"), &["a.toml:7", "zenoh.input_listen", "no endpoint"]),
+        (
+            text("alpha", KEY, "[zenoh]\ninput_listen = [\"tcp/127.0.0.1:0\"]"),
+            &["a.toml:7", "another port at each start"],
+        ),
+        (
+            text("alpha", KEY, "[zenoh]\ninput_listen = [\"tcp/127.0.0.1:7448\", \"tcp/10.0.0.2:7448\"]"),
+            &["a.toml:7", "tcp/10.0.0.2:7448", "zenoh.input_users_file"],
+        ),
+        (
+            text("alpha", KEY, "[zenoh]\ninput_listen = [\"tcp/[::1]:1\"]\nlisten = [\"tcp/[::1]:1\"]"),
+            &["a.toml:7", "is in zenoh.listen, too"],
+        ),
+        (text("alpha", KEY, "[debug]\nbytes_per_sec = 999"), &["a.toml:7", "debug.bytes_per_sec", "1000 to"]),
         (text("alpha", KEY, "[zenoh]\nmode = \"mesh\""), &["a.toml:7", "`mesh`", "`peer`"]),
         (
             text("alpha", KEY, "[core.submap]\n\nvoxel_m = -1"),
@@ -71,6 +86,29 @@ fn the_bounds_of_input_are_within_them() {
             FileConfig::parse(&text("alpha", KEY, &format!("[zenoh]\ninput_bytes_max = {bytes}")), Path::new("a"));
         assert_eq!(config.unwrap().zenoh.input_bytes_max, bytes);
     }
+}
+
+/// Who may feed a robot by the session of the robots: this host, if that session never leaves it.
+#[test]
+fn a_swarm_on_one_host_takes_input_on_its_own_session_and_no_other_does() {
+    let feeding = |lines: &str| {
+        let config = FileConfig::parse(&text("alpha", KEY, &format!("[zenoh]\n{lines}")), Path::new("a")).unwrap();
+        config.zenoh.feeding_interfaces()
+    };
+    let nobody = [String::new(); 0];
+    let alone = "multicast = false\nlisten = [\"tcp/127.0.0.1:7\", \"tcp/[::1]:7\", \"tcp/localhost:8\"]";
+    assert_eq!(feeding(alone), ["lo", "lo0"]);
+    assert_eq!(feeding(&format!("{alone}\nconnect = [\"tcp/127.0.0.2:7\"]")), ["lo", "lo0"]);
+    assert_eq!(feeding(&format!("{alone}\nconnect = [\"tcp/10.0.0.2:7\"]")), nobody);
+    assert_eq!(feeding(&format!("{alone}\ninput_listen = [\"tcp/127.0.0.1:9\"]")), nobody);
+    assert_eq!(feeding(&alone.replace("false", "true")), nobody);
+    assert_eq!(feeding("multicast = false\nlisten = [\"tcp/[::]:7\"]"), nobody);
+    assert_eq!(feeding("multicast = false\nlisten = []"), nobody);
+    assert_eq!(feeding("multicast = false\nmode = \"client\"\nconnect = [\"tcp/127.0.0.1:7\"]"), nobody);
+    assert_eq!(feeding(""), nobody);
+    assert_eq!(feeding("input_interfaces = [\"eth0\"]"), ["eth0"]);
+    let users = "input_listen = [\"tcp/10.0.0.2:7448\"]\ninput_users_file = \"users\"";
+    assert_eq!(feeding(users), nobody);
 }
 
 #[test]

@@ -1,5 +1,5 @@
 //! Agents on real Zenoh, over loopback: everything that one core says reaches the other as it was said, every question
-//! ends in one answer, floods are dropped and counted, and `…/in/*` is for this host alone.
+//! ends in one answer, and floods are dropped and counted.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod common;
@@ -180,7 +180,7 @@ async fn strangers_and_oversized_messages_stop_at_the_edge() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_robots_own_slam_feeds_it_in_json_and_postcard_from_this_host_alone() {
+async fn a_swarm_on_one_host_is_fed_in_json_and_postcard_on_its_own_session() {
     let dir = tempfile::tempdir().unwrap();
     let mut configs = swarm(dir.path(), &["alpha", "beta"]);
     configs[1].zenoh.input_interfaces = vec!["none0".into()]; // as if we were another computer

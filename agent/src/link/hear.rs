@@ -43,10 +43,15 @@ pub(super) async fn start(shared: &Arc<Shared>) -> Result<JoinHandle<()>, LinkEr
     }
     for input in keys::INPUTS {
         let key = shared.own(&format!("in/{input}"));
-        let s = shared.clone();
-        let subscriber = shared.session.declare_subscriber(key.clone());
-        let heard = move |sample: Sample| own(&s, input, &sample);
-        subscriber.callback(heard).background().await.map_err(refused(key))?;
+        if let Some(door) = &shared.door.session {
+            let s = shared.clone();
+            let subscriber = door.declare_subscriber(key.clone()).callback(move |sample| own(&s, input, &sample));
+            subscriber.background().await.map_err(refused(key.clone()))?;
+        }
+        let (s, feeds) = (shared.clone(), !shared.door.interfaces.is_empty());
+        let heard = move |sample: Sample| if feeds { own(&s, input, &sample) } else { from_anyone(&s, input) };
+        let subscriber = shared.session.declare_subscriber(key.clone()).callback(heard);
+        subscriber.background().await.map_err(refused(key))?;
     }
     let key = keys::of_all(&shared.swarm, keys::ALIVE);
     let (s, p) = (shared.clone(), present);
@@ -119,6 +124,19 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
             let reason = reason.to_string();
             refuse(shared, input, first_words(&reason), &reason);
         }
+    }
+}
+
+/// Refuses input that came by the session of the robots, where anyone may have sent it. It leaves no gap in the odometry:
+/// else anyone could make one.
+fn from_anyone(shared: &Shared, input: &str) {
+    if shared.drops().count_first(format!("refused: in/{input} from the network of the robots")) {
+        let cure = shared.door.cure();
+        tracing::warn!(
+            input,
+            cure,
+            "refused input that came by the network of the robots, where anyone can send; the next is only counted"
+        );
     }
 }
 

@@ -2,6 +2,8 @@
 //! return, because an undrained handler blocks the whole link; what is sent leaves from a thread of its own, because
 //! sending may wait for a slow neighbour; every question ends in exactly one `Input::Answered` without bytes.
 
+mod allowance;
+mod door;
 mod hear;
 mod say;
 pub mod scouting;
@@ -12,6 +14,7 @@ use crate::config::FileConfig;
 use crate::driver::{Network, Outgoing, Snapshots};
 use crate::keys;
 use crate::queue::{Drops, Inbox};
+use door::Door;
 use merganser_protocol::agent::io::{AskToken, QueryKind};
 use merganser_protocol::ids::{Name, RobotId};
 use session::LinkError;
@@ -34,6 +37,7 @@ const ANSWERS_MAX: usize = 16;
 #[derive(Debug)]
 pub struct Link {
     session: Session,
+    door: Option<Session>,
     token: Option<LivelinessToken>,
     tasks: Vec<JoinHandle<()>>,
     close_wait: Duration,
@@ -43,6 +47,8 @@ pub struct Link {
 #[derive(Debug)]
 struct Shared {
     session: Session,
+    /// Where the robot's own SLAM comes in.
+    door: Door,
     swarm: Name,
     robot: Name,
     inbox: Inbox,
@@ -61,16 +67,18 @@ struct Shared {
 pub struct Sender(std::sync::mpsc::SyncSender<Outgoing>, Arc<Shared>);
 
 impl Link {
-    /// Opens a session and the way out. Nothing is heard or served before [`Opened::start`].
+    /// Opens the session of the robots with the way out, and the door for the robot's own SLAM. Nothing is heard or served before [`Opened::start`].
     ///
     /// # Errors
     /// [`LinkError`].
     pub async fn open(config: &FileConfig, inbox: Inbox) -> Result<(Opened, Sender), LinkError> {
         let session = session::open(&config.zenoh, session::Role::Robot).await?;
+        let door = Door::open(config).await?;
         let ids = config.roster.iter().map(|(name, key)| (name.clone(), RobotId::of_key(&key.to_bytes())));
         let ids: BTreeMap<Name, RobotId> = ids.collect();
         let shared = Arc::new(Shared {
             session,
+            door,
             swarm: config.swarm.clone(),
             robot: config.robot.clone(),
             inbox,
@@ -94,6 +102,9 @@ impl Link {
         if let Some(token) = self.token.take() {
             let _ = token.undeclare().await; // closing withdraws it too
         }
+        if let Some(door) = &self.door {
+            session::close(door, self.close_wait).await;
+        }
         session::close(&self.session, self.close_wait).await;
     }
 }
@@ -113,11 +124,20 @@ impl Opened {
     pub async fn start(self, snapshots: Snapshots) -> Result<Link, LinkError> {
         let Self { shared, config } = self;
         let mut tasks = vec![hear::start(&shared).await?];
+        if let Some(session) = &shared.door.session {
+            tasks.push(tokio::spawn(door::watch(session.clone(), config.zenoh.clone())));
+        }
         tasks.push(views::start(shared.clone(), snapshots, &config.debug, config.zenoh.message_bytes_max).await?);
         let key = keys::of(&shared.swarm, &shared.robot, keys::ALIVE);
         let token = shared.session.liveliness().declare_token(key.clone()).await.map_err(refused(key))?;
         let close_wait = Duration::from_secs_f64(config.zenoh.close_secs);
-        Ok(Link { session: shared.session.clone(), token: Some(token), tasks, close_wait })
+        Ok(Link {
+            session: shared.session.clone(),
+            door: shared.door.session.clone(),
+            token: Some(token),
+            tasks,
+            close_wait,
+        })
     }
 }
 
@@ -163,6 +183,20 @@ impl Shared {
         tokio::task::spawn_blocking(move || {
             use zenoh::Wait as _;
             if let Err(reason) = question.reply(key, bytes).encoding(encoding).wait() {
+                tracing::debug!(%reason, "an answer did not leave");
+            }
+            drop(permit);
+        });
+    }
+
+    /// Replies with an error in words.
+    fn reply_error(&self, question: Query, told: String) {
+        let Ok(permit) = self.answering.clone().try_acquire_owned() else {
+            return self.drops().count("answer dropped: too many on their way");
+        };
+        tokio::task::spawn_blocking(move || {
+            use zenoh::Wait as _;
+            if let Err(reason) = question.reply_err(told).encoding(Encoding::TEXT_PLAIN).wait() {
                 tracing::debug!(%reason, "an answer did not leave");
             }
             drop(permit);

@@ -1,9 +1,10 @@
 //! A Zenoh session as Merganser wants it: explicit endpoints, bounded messages, links that one side alone opens, and an
-//! access list that lets only this host speak on `…/in/*`.
+//! access list of who may speak on which keys.
 
 use crate::config::{Mode, ZenohConfig};
 use crate::keys;
 use crate::link::scouting::Place;
+use merganser_protocol::ids::Name;
 use serde_json::{Value, json};
 use std::time::Duration;
 use thiserror::Error;
@@ -69,8 +70,30 @@ pub enum Role {
 /// # Errors
 /// [`LinkError`].
 pub async fn open(config: &ZenohConfig, role: Role) -> Result<Session, LinkError> {
-    let refused = |reason| LinkError::Open { listen: config.listen.clone(), reason };
-    let settings = settings(config, role)?;
+    opened(settings(config, role)?, &config.listen).await
+}
+
+/// Where the robot's own SLAM comes in.
+#[derive(Debug)]
+pub struct Entry<'a> {
+    /// The robot's swarm.
+    pub swarm: &'a Name,
+    /// The robot whose input is taken.
+    pub robot: &'a Name,
+    /// Where to listen.
+    pub endpoints: &'a [String],
+}
+
+/// Opens a session that looks for nobody, and on which nothing but the robot's own input can be published.
+///
+/// # Errors
+/// [`LinkError`].
+pub async fn open_entry(config: &ZenohConfig, entry: &Entry<'_>) -> Result<Session, LinkError> {
+    opened(entry_settings(config, entry)?, entry.endpoints).await
+}
+
+async fn opened(settings: Config, listen: &[String]) -> Result<Session, LinkError> {
+    let refused = |reason| LinkError::Open { listen: listen.to_vec(), reason };
     match tokio::time::timeout(OPEN_TIMEOUT, zenoh::open(settings)).await {
         Ok(session) => session.map_err(|error| refused(in_words(error))),
         Err(_) => Err(refused(format!("no answer in {} s", OPEN_TIMEOUT.as_secs()))),
@@ -87,8 +110,8 @@ pub async fn close(session: &Session, wait: Duration) {
 }
 
 fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
-    let mut settings = Config::default();
-    for (key, value) in [
+    let feeding = config.feeding_interfaces();
+    taken([
         ("mode", json!(config.mode.as_str())),
         (
             "listen/endpoints",
@@ -107,24 +130,66 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
         ("transport/link/tx/lease", json!((config.lease_secs * 1e3) as u64)),
         ("transport/link/rx/max_message_size", json!(message_bytes_max(config, role))),
         ("transport/shared_memory/enabled", json!(false)),
-        ("access_control", access(&config.input_interfaces)),
-    ] {
-        settings.insert_json5(key, &value.to_string()).map_err(|error| LinkError::Setting {
-            key,
-            value,
-            reason: in_words(error),
-        })?;
+        ("access_control", access(&feeding)),
+    ])
+}
+
+fn entry_settings(config: &ZenohConfig, entry: &Entry<'_>) -> Result<Config, LinkError> {
+    let inputs = keys::of(entry.swarm, entry.robot, "in/*");
+    let everyone = json!([{"id": "everyone"}]);
+    let rule = |id: &str, messages: Value, flow: Value, key: &str| json!({"id": id, "permission": "allow", "messages": messages, "flows": flow, "key_exprs": [key]});
+    let mut settings = taken([
+        ("mode", json!("peer")),
+        ("listen/endpoints", json!(entry.endpoints)),
+        ("connect/endpoints", json!([])),
+        ("scouting/multicast/enabled", json!(false)),
+        ("scouting/gossip/enabled", json!(false)),
+        ("transport/link/tx/lease", json!((config.lease_secs * 1e3) as u64)),
+        ("transport/link/rx/max_message_size", json!(config.input_bytes_max + INPUT_SLACK_BYTES)),
+        ("transport/shared_memory/enabled", json!(false)),
+        (
+            "access_control",
+            json!({
+                "enabled": true,
+                "default_permission": "deny",
+                "rules": [
+                    rule("ask and declare", asking(), json!(["ingress", "egress"]), "**"),
+                    rule("show", json!(["put", "delete"]), json!(["egress"]), "**"),
+                    rule("feed", json!(["put"]), json!(["ingress"]), &inputs),
+                ],
+                "subjects": everyone,
+                "policies": [{"rules": ["ask and declare", "show", "feed"], "subjects": ["everyone"]}],
+            }),
+        ),
+    ])?;
+    if let Some(users) = &config.input_users_file {
+        let users = json!(users);
+        let (key, value) = ("transport/auth/usrpwd/dictionary_file", users.to_string());
+        settings.insert_json5(key, &value).map_err(|error| refused_setting(key, users, error))?;
     }
     Ok(settings)
 }
 
-/// Zenoh has one bound for all links, and drops what exceeds it without a word. So it lets in what the robot's own SLAM
-/// may send, and a little more, of which we can tell that it is too much; what peers send is measured when it is whole.
-fn message_bytes_max(config: &ZenohConfig, role: Role) -> usize {
-    match role {
-        Role::Robot => config.message_bytes_max.max(config.input_bytes_max + INPUT_SLACK_BYTES),
-        Role::Onlooker => config.message_bytes_max,
+fn taken<const N: usize>(values: [(&'static str, Value); N]) -> Result<Config, LinkError> {
+    let mut settings = Config::default();
+    for (key, value) in values {
+        settings.insert_json5(key, &value.to_string()).map_err(|error| refused_setting(key, value, error))?;
     }
+    Ok(settings)
+}
+
+fn refused_setting(key: &'static str, value: Value, error: impl std::fmt::Display) -> LinkError {
+    LinkError::Setting { key, value, reason: in_words(error) }
+}
+
+/// Zenoh has one bound for all links, and drops what exceeds it without a word. Where the robot's own SLAM may send, it
+/// lets in what that may send, and a little more, of which we can tell that it is too much; what peers send is measured
+/// when it is whole.
+fn message_bytes_max(config: &ZenohConfig, role: Role) -> usize {
+    if role == Role::Robot && !config.feeding_interfaces().is_empty() {
+        return config.message_bytes_max.max(config.input_bytes_max + INPUT_SLACK_BYTES);
+    }
+    config.message_bytes_max
 }
 
 /// An error of Zenoh without the places in its sources (` at /…/endpoint.rs:615.`), which help no user.
@@ -159,16 +224,9 @@ fn strategy(role: Role) -> Value {
            "peer": {"to_router": "always", "to_peer": among_peers}})
 }
 
-/// Everything may be asked, declared and sent. What may come in as a publication is what [`keys`] knows, and `…/in/*`
-/// only over `interfaces`, which are this host's loopbacks. Zenoh looks at the interface of the last link: a neighbour
-/// that runs on this host and relays for others is trusted with what it relays.
-fn access(interfaces: &[String]) -> Value {
-    let table = keys::CHANNELS.iter().map(|channel| keys::channel(*channel).to_string()).chain(["view/*".into()]);
-    let broadcast: Vec<String> = table.map(|rest| format!("{}/*/*/{rest}", keys::PREFIX)).collect();
-    let anyone = json!({"id": "anyone"});
-    let host = json!({"id": "this host", "interfaces": interfaces});
-    let everything = json!(["**"]);
-    let asking = json!([
+/// All messages but publications.
+fn asking() -> Value {
+    json!([
         "query",
         "reply",
         "declare_subscriber",
@@ -176,23 +234,37 @@ fn access(interfaces: &[String]) -> Value {
         "liveliness_token",
         "liveliness_query",
         "declare_liveliness_subscriber"
-    ]);
+    ])
+}
+
+/// Everything may be asked, declared and sent. What may come in as a publication is what [`keys`] knows; if input is
+/// taken over `interfaces`, over these alone, and else from anyone, to be counted and refused. Zenoh looks at the
+/// interface of the last link: a neighbour that runs on this host and relays for others is trusted with what it relays.
+fn access(interfaces: &[String]) -> Value {
+    let inputs = interfaces.is_empty().then(|| "in/*".to_owned());
+    let table = keys::CHANNELS.iter().map(|channel| keys::channel(*channel).to_string()).chain(["view/*".into()]);
+    let heard: Vec<String> = table.chain(inputs).map(|rest| format!("{}/*/*/{rest}", keys::PREFIX)).collect();
+    let everything = json!(["**"]);
     let rule = |id: &str, messages: Value, flows: Value, key_exprs: &Value| json!({"id": id, "permission": "allow", "messages": messages, "flows": flows, "key_exprs": key_exprs});
     let publications = || json!(["put", "delete"]);
+    let mut rules = vec![
+        rule("ask and declare", asking(), json!(["ingress", "egress"]), &everything),
+        rule("send", publications(), json!(["egress"]), &everything),
+        rule("hear", publications(), json!(["ingress"]), &json!(heard)),
+    ];
+    let mut subjects = vec![json!({"id": "anyone"})];
+    let mut policies = vec![json!({"rules": ["ask and declare", "send", "hear"], "subjects": ["anyone"]})];
+    if !interfaces.is_empty() {
+        rules.push(rule("feed", publications(), json!(["ingress"]), &everything));
+        subjects.push(json!({"id": "these interfaces", "interfaces": interfaces}));
+        policies.push(json!({"rules": ["feed"], "subjects": ["these interfaces"]}));
+    }
     json!({
         "enabled": true,
         "default_permission": "deny",
-        "rules": [
-            rule("ask and declare", asking, json!(["ingress", "egress"]), &everything),
-            rule("send", publications(), json!(["egress"]), &everything),
-            rule("hear broadcasts", publications(), json!(["ingress"]), &json!(broadcast)),
-            rule("hear this host", publications(), json!(["ingress"]), &everything),
-        ],
-        "subjects": [anyone, host],
-        "policies": [
-            {"rules": ["ask and declare", "send", "hear broadcasts"], "subjects": ["anyone"]},
-            {"rules": ["hear this host"], "subjects": ["this host"]},
-        ],
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
     })
 }
 
@@ -214,12 +286,27 @@ mod tests {
             let settings = settings(&ZenohConfig { mode, ..config.clone() }, role).unwrap();
             let connect = settings.get_json("connect/endpoints").unwrap();
             assert!(connect.contains("7002") && !connect.contains("7001"), "{connect}");
-            assert_eq!(settings.get_json("transport/link/rx/max_message_size").unwrap(), "6356992");
+            assert_eq!(settings.get_json("transport/link/rx/max_message_size").unwrap(), "1048576", "scouted");
         }
         let bound =
             |config: &ZenohConfig, role| settings(config, role).unwrap().get_json("transport/link/rx/max_message_size");
+        config.multicast = false;
+        assert_eq!(bound(&config, Role::Robot).unwrap(), "6356992", "this host alone, whose SLAM feeds it");
         assert_eq!(bound(&config, Role::Onlooker).unwrap(), "1048576", "nobody feeds an onlooker");
         config.input_bytes_max = 1 << 16;
         assert_eq!(bound(&config, Role::Robot).unwrap(), "1048576", "what peers may send, at least");
+    }
+
+    #[test]
+    fn the_entry_looks_for_nobody_and_lets_in_only_the_robots_own_input() {
+        let (swarm, robot) = (Name::new("demo").unwrap(), Name::new("alpha").unwrap());
+        let entry = Entry { swarm: &swarm, robot: &robot, endpoints: &["tcp/127.0.0.1:7448".into()] };
+        let config = ZenohConfig { input_users_file: Some("/x/users".into()), ..ZenohConfig::default() };
+        let settings = entry_settings(&config, &entry).unwrap();
+        let of = |key: &str| settings.get_json(key).unwrap();
+        assert_eq!((of("scouting/multicast/enabled"), of("scouting/gossip/enabled")), ("false".into(), "false".into()));
+        assert_eq!(of("transport/link/rx/max_message_size"), "6356992");
+        assert!(of("access_control").contains("merganser/v1/demo/alpha/in/*"));
+        assert_eq!(of("transport/auth/usrpwd/dictionary_file"), "\"/x/users\"");
     }
 }
