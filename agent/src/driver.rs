@@ -306,6 +306,14 @@ fn tell(event: &Event) {
             "what {robot} states does not fit together as others see it: its odometry is wrong, or less certain than it \
              says"
         ),
+        Event::EpochsRetired { robot, first, count } => warn!(
+            robot,
+            first,
+            count,
+            "it began more epochs than gossip.epochs_per_robot_max or its share of gossip.facts_bytes_max allow, and gave \
+             up its oldest with their maps; if its SLAM does not restart that often, see that one process alone runs \
+             under its key"
+        ),
         Event::EpochBegan { frame, reason } => info!(%frame, reason = reason.text(), "a new epoch begins"),
         Event::Condensed { frame, parts, submaps_gone, bytes: [before, after] } => {
             info!(%frame, parts, submaps_gone, before, after, "log condensed");

@@ -86,6 +86,8 @@ pub enum StoredRecord {
     Session(u32, u64, Vec<u64>),
     /// A pair that was refused, and what that rests on.
     Refused(SubmapId, SubmapId, Option<u64>),
+    /// A log that its writer gave up.
+    Retired(FrameId, Vec<SubmapId>, Vec<Hash>),
 }
 
 impl From<&Record> for StoredRecord {
@@ -99,6 +101,7 @@ impl From<&Record> for StoredRecord {
             Record::Replaced { below, submaps, blobs } => Self::Replaced(*below, submaps.clone(), blobs.clone()),
             Record::Session { epoch, session, over } => Self::Session(*epoch, *session, over.clone()),
             Record::Refused { i, j, evidence } => Self::Refused(*i, *j, *evidence),
+            Record::Retired { frame, submaps, blobs } => Self::Retired(*frame, submaps.clone(), blobs.clone()),
         }
     }
 }
@@ -114,6 +117,7 @@ impl From<StoredRecord> for Record {
             StoredRecord::Replaced(below, submaps, blobs) => Self::Replaced { below, submaps, blobs },
             StoredRecord::Session(epoch, session, over) => Self::Session { epoch, session, over },
             StoredRecord::Refused(i, j, evidence) => Self::Refused { i, j, evidence },
+            StoredRecord::Retired(frame, submaps, blobs) => Self::Retired { frame, submaps, blobs },
         }
     }
 }

@@ -246,7 +246,11 @@ fn weight(batch: &Batch) -> usize {
         Record::Entry { bytes, .. } | Record::Blob { bytes, .. } | Record::Private { bytes, .. } => bytes.len(),
         Record::Fork { proof, .. } => proof.iter().map(Vec::len).sum(),
         // A few bytes each.
-        Record::EpochClosed { .. } | Record::Replaced { .. } | Record::Session { .. } | Record::Refused { .. } => 0,
+        Record::EpochClosed { .. }
+        | Record::Replaced { .. }
+        | Record::Retired { .. }
+        | Record::Session { .. }
+        | Record::Refused { .. } => 0,
     };
     batch.records.iter().map(bytes).sum()
 }

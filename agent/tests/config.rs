@@ -95,7 +95,7 @@ fn a_swarm_on_one_host_takes_input_on_its_own_session_and_no_other_does() {
         let config = FileConfig::parse(&text("alpha", KEY, &format!("[zenoh]\n{lines}")), Path::new("a")).unwrap();
         config.zenoh.feeding_interfaces()
     };
-    let nobody = [String::new(); 0];
+    let nobody: [String; 0] = [];
     let alone = "multicast = false\nlisten = [\"tcp/127.0.0.1:7\", \"tcp/[::1]:7\", \"tcp/localhost:8\"]";
     assert_eq!(feeding(alone), ["lo", "lo0"]);
     assert_eq!(feeding(&format!("{alone}\nconnect = [\"tcp/127.0.0.2:7\"]")), ["lo", "lo0"]);

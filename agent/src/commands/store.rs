@@ -127,7 +127,11 @@ fn verify(config: &Path) -> Result<bool> {
                 proofs.push((*frame, a.clone(), b.clone()));
             }
             // Their seals are all that can be wrong with them.
-            Record::EpochClosed { .. } | Record::Session { .. } | Record::Refused { .. } | Record::Replaced { .. } => {}
+            Record::EpochClosed { .. }
+            | Record::Session { .. }
+            | Record::Refused { .. }
+            | Record::Replaced { .. }
+            | Record::Retired { .. } => {}
         }
     }
     let count = entries.len();
@@ -195,7 +199,9 @@ fn stats(config: &Path) -> Result<bool> {
             Record::Private { bytes, .. } => (others.entry("private").or_default(), bytes.len()),
             Record::Fork { proof: [a, b], .. } => (others.entry("forks").or_default(), a.len() + b.len()),
             Record::Refused { .. } => (others.entry("refused").or_default(), REFUSED_LEN),
-            Record::EpochClosed { .. } | Record::Session { .. } | Record::Replaced { .. } => continue,
+            Record::EpochClosed { .. } | Record::Session { .. } | Record::Replaced { .. } | Record::Retired { .. } => {
+                continue;
+            }
         };
         row.0 += 1;
         row.1 += bytes as u64;

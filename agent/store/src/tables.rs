@@ -187,17 +187,28 @@ fn put(transaction: &WriteTransaction, record: &Record) -> Result<(), CommitErro
         Record::Replaced { below, submaps, blobs } => {
             let entries = join_key(below.frame, 0)..join_key(below.frame, below.seq);
             transaction.open_table(ENTRIES)?.retain_in(entries, |_, _| false)?;
-            let mut private = transaction.open_table(PRIVATE)?;
-            for submap in submaps {
-                private.remove(join_key(submap.frame, submap.index))?;
-            }
-            let mut stored = transaction.open_table(BLOBS)?;
-            for blob in blobs {
-                stored.remove(blob.0)?;
-            }
-            Ok(())
+            remove_own(transaction, submaps, blobs)
+        }
+        Record::Retired { frame, submaps, blobs } => {
+            let entries = join_key(*frame, 0)..=join_key(*frame, u32::MAX);
+            transaction.open_table(ENTRIES)?.retain_in(entries, |_, _| false)?;
+            transaction.open_table(FORKS)?.remove(join_key(*frame, 0))?;
+            remove_own(transaction, submaps, blobs)
         }
     }
+}
+
+/// Removes what is private to own submaps, and blobs.
+fn remove_own(transaction: &WriteTransaction, submaps: &[SubmapId], blobs: &[Hash]) -> Result<(), CommitError> {
+    let mut private = transaction.open_table(PRIVATE)?;
+    for submap in submaps {
+        private.remove(join_key(submap.frame, submap.index))?;
+    }
+    let mut stored = transaction.open_table(BLOBS)?;
+    for blob in blobs {
+        stored.remove(blob.0)?;
+    }
+    Ok(())
 }
 
 /// Inserts a sealed value; gives back what was there, if that was sound.

@@ -269,6 +269,15 @@ pub enum Record {
         /// Keypoint blobs that no submap of ours names any more.
         blobs: Vec<Hash>,
     },
+    /// A log that its writer gave up: entries and proof are to be taken off the disk.
+    Retired {
+        /// The log.
+        frame: FrameId,
+        /// Own submaps that are gone: what is private to them.
+        submaps: Vec<SubmapId>,
+        /// Keypoint blobs that no submap of ours names any more.
+        blobs: Vec<Hash>,
+    },
 }
 
 /// Something people may want to know. Shells log it; tests assert on it.
@@ -412,6 +421,15 @@ pub enum Event {
         frame: FrameId,
         /// In what way.
         oddity: Oddity,
+    },
+    /// A robot gave up its oldest epochs, to have room for a new one. Their maps are gone.
+    EpochsRetired {
+        /// The robot's name.
+        robot: String,
+        /// Its first epoch that stays.
+        first: u32,
+        /// How many logs went here.
+        count: usize,
     },
     /// A new epoch, hence a new frame, began.
     EpochBegan {

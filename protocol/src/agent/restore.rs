@@ -2,6 +2,7 @@
 
 use super::io::{EpochReason, Record};
 use super::{Agent, Restored};
+use crate::ids::SubmapId;
 use crate::submap::runs::Runs;
 
 impl Agent {
@@ -22,7 +23,7 @@ impl Agent {
                 Record::Session { epoch, session: now, over } => session = session.max(Some((epoch, now, over))),
                 Record::Refused { i, j, evidence: Some(evidence) } => refused.push(((i, j), evidence)),
                 // A store gives back what is there.
-                Record::Replaced { .. } | Record::Refused { evidence: None, .. } => {}
+                Record::Replaced { .. } | Record::Retired { .. } | Record::Refused { evidence: None, .. } => {}
             }
         }
         let closed = closed.max(self.replication.restore(&mut self.context, entries, forks));
@@ -30,6 +31,9 @@ impl Agent {
             self.begin_epoch(closed.saturating_add(1).max(restored.fresh_epoch), EpochReason::Log);
         }
         self.alignment.restore_refusals(refused);
+        let stored: Vec<SubmapId> = private.iter().map(|(submap, _)| *submap).collect();
+        let gone = self.replication.drop_retired(&mut self.context, &stored).unwrap_or_default();
+        private.retain(|(submap, _)| !gone.contains(submap));
         self.relearn();
         // Only now it is known which are ours.
         let blobs = self.replication.own_first(&self.context, blobs);

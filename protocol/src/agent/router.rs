@@ -280,6 +280,12 @@ impl Agent {
                 self.on_fork(frame);
                 return true;
             }
+            // Others hold more of our past than they may: an epoch that gives some of it up makes room.
+            Heard::Crowded => {
+                if self.replication.is_begun(&self.context) {
+                    self.begin_next_epoch(EpochReason::Log);
+                }
+            }
             Heard::Nothing => {}
         }
         false
@@ -330,6 +336,10 @@ impl Agent {
         for id in &durable.entries {
             self.replication.mark_durable(*id);
             self.learn(*id);
+        }
+        if let Some(gone) = self.replication.drop_retired(&mut self.context, &[]) {
+            self.relearn();
+            self.alignment.forget(&gone);
         }
         self.replication.publish_durable(&mut self.context, durable);
     }

@@ -29,12 +29,9 @@ pub enum AppendError {
         /// The latest one.
         latest: u32,
     },
-    /// This robot began so many epochs that nobody would take another. Two processes with its key do that to one
-    /// another.
-    #[error(
-        "{0} has more epochs than gossip.epochs_per_robot_max, and the others would refuse one more; see that only one \
-         process runs under its key, and give the robot a new key"
-    )]
+    /// No epoch can follow this robot's last one, or nobody would take another: its older ones were not
+    /// [given up](Replica::to_retire) first.
+    #[error("{0} has no epoch left that others would take; give the robot a new key")]
     EpochLimit(RobotId),
     /// The log is full or quarantined, or others hold entries of it that this robot did not write in this run or load
     /// from its store. Writing on would tell a second story.
@@ -43,7 +40,7 @@ pub enum AppendError {
 }
 
 impl Replica {
-    /// OverlapFeatures a fact as the next entry of this robot's log of `frame_epoch`. It is held at once, but shown to
+    /// Appends a fact as the next entry of this robot's log of `frame_epoch`. It is held at once, but shown to
     /// nobody until [`Replica::mark_durable`].
     ///
     /// # Errors
@@ -51,11 +48,11 @@ impl Replica {
     pub fn append(&mut self, key: &SigningKey, frame_epoch: u32, fact: &Fact) -> Result<Entry, AppendError> {
         let robot = RobotId::of_key(key.verifying_key().as_bytes());
         let entry = self.next_entry(key, robot, frame_epoch, fact, false)?;
-        self.log_mut(entry.id().frame).push(Held::new(entry.encode().into(), entry.floor()));
+        self.log_mut(entry.id().frame).push(Held::of(&entry, entry.encode().into()));
         Ok(entry)
     }
 
-    /// OverlapFeatures these facts as the next entries of this robot's log of `frame_epoch`; the first states its own
+    /// Appends these facts as the next entries of this robot's log of `frame_epoch`; the first states its own
     /// place as the floor, and once it is durable everything below it is gone, here and on every robot that hears of
     /// it.
     ///
@@ -74,7 +71,7 @@ impl Replica {
             let fact = Fact::Condensed(part.clone());
             match self.next_entry(key, robot, frame_epoch, &fact, entries.is_empty()) {
                 Ok(entry) => {
-                    self.log_mut(frame).push(Held::new(entry.encode().into(), entry.floor()));
+                    self.log_mut(frame).push(Held::of(&entry, entry.encode().into()));
                     entries.push(entry);
                 }
                 Err(error) => {
@@ -111,7 +108,6 @@ impl Replica {
                 let (next, floor) = (log.next_seq(), log.floor());
                 (next, if raises { next } else { floor }, log.head().map(|head| head.hash).unwrap_or_default())
             }
-            None if self.check_epoch(frame).is_err() => return Err(AppendError::EpochLimit(robot)),
             None => (0, 0, Hash::default()),
         };
         let id = EntryId { frame, seq };
@@ -119,6 +115,13 @@ impl Replica {
             return needed("it is full");
         }
         let (kind, payload) = (fact.kind(), fact.to_payload()?);
-        Ok(Entry::sign(key, EntryContent { swarm: self.swarm, id, kind, floor, previous, payload })?)
+        let entry = Entry::sign(key, EntryContent { swarm: self.swarm, id, kind, floor, previous, payload })?;
+        if self.check_epoch(&entry).is_err() {
+            return Err(AppendError::EpochLimit(robot));
+        }
+        if self.check_bytes(&entry, entry.encode().len()).is_err() {
+            return needed("this robot has filled its share of gossip.facts_bytes_max");
+        }
+        Ok(entry)
     }
 }

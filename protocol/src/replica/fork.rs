@@ -29,7 +29,10 @@ impl Replica {
         if self.is_quarantined(frame) {
             return Ok((frame, false));
         }
-        self.check_epoch(frame)?;
+        if self.is_retired(frame) {
+            return Ok((frame, false));
+        }
+        self.check_epoch(&first)?;
         self.verify(&first)?;
         self.verify(&second)?;
         self.quarantine(frame, a, b);

@@ -137,6 +137,10 @@ impl Replica {
     /// while we do not.
     pub fn ahead_of_us(&self, have: &Have) -> BTreeMap<FrameId, Option<u32>> {
         let ahead = |(frame, head): (FrameId, Head)| {
+            // What we would not take is not asked for.
+            if self.is_retired(frame) || self.is_full(frame.robot) {
+                return None;
+            }
             let ours = match self.slots.get(&frame) {
                 Some(Slot::Forked(_)) => return None,
                 Some(Slot::Log(log)) => log.durable(),

@@ -5,7 +5,9 @@
 //! on at the floor; until that is durable, what is held is shown as before.
 
 use crate::ids::Hash;
-use crate::wire::Entry;
+use crate::wire::fact::RetiredFact;
+use crate::wire::payload::KIND_RETIRED;
+use crate::wire::{Entry, Fact};
 use std::collections::BTreeMap;
 
 /// An entry held.
@@ -14,13 +16,36 @@ pub(super) struct Held {
     pub bytes: Box<[u8]>,
     pub hash: Hash,
     pub floor: u32,
+    /// The first of its writer's epochs that stays, if it says so.
+    pub retires: Option<u32>,
     pub durable: bool,
 }
 
+/// What an entry takes in memory beyond its bytes, roughly.
+pub(super) const HELD_BYTES: usize = 128;
+
 impl Held {
-    /// An entry from its canonical bytes and the floor it states.
-    pub fn new(bytes: Box<[u8]>, floor: u32) -> Self {
-        Self { hash: Hash::of(&bytes), bytes, floor, durable: false }
+    /// An entry from its canonical bytes, and what it states of its log and of its writer's epochs.
+    pub fn new(bytes: Box<[u8]>, floor: u32, retires: Option<u32>) -> Self {
+        Self { hash: Hash::of(&bytes), bytes, floor, retires, durable: false }
+    }
+
+    /// An entry with its canonical bytes.
+    pub fn of(entry: &Entry, bytes: Box<[u8]>) -> Self {
+        Self::new(bytes, entry.floor(), retires(entry))
+    }
+
+    /// What it is counted for.
+    fn cost(&self) -> usize {
+        self.bytes.len() + HELD_BYTES
+    }
+}
+
+/// The first of its writer's epochs that stays, if an entry says so: of epochs that are to come none can go.
+pub(super) fn retires(entry: &Entry) -> Option<u32> {
+    match (entry.kind() == KIND_RETIRED).then(|| entry.fact()) {
+        Some(Ok(Fact::Retired(RetiredFact { below }))) => Some(below.get().min(entry.id().frame.epoch)),
+        _ => None,
     }
 }
 
@@ -43,6 +68,10 @@ pub(super) struct Log {
     entries: Vec<Held>,
     /// Entries `first..durable` are durable; at least `first`.
     durable: u32,
+    /// What `entries` are counted for.
+    bytes: usize,
+    /// The first of the writer's epochs that stays, by any entry so far, durable or not.
+    stays: u32,
     /// What begins at a floor beyond the entries, until it is durable.
     beyond: Option<Box<Log>>,
     /// Verified entries that wait for their predecessor. Bounded by the set.
@@ -106,12 +135,37 @@ impl Log {
 
     /// Adds the next entry, of which [`Self::link`] says that it fits.
     pub fn push(&mut self, held: Held) {
-        self.last_mut().entries.push(held);
+        let last = self.last_mut();
+        last.bytes += held.cost();
+        last.stays = last.stays.max(held.retires.unwrap_or_default());
+        last.entries.push(held);
     }
 
     /// Takes the last entry back.
     pub fn pop(&mut self) -> Option<Held> {
-        self.last_mut().entries.pop()
+        let last = self.last_mut();
+        let held = last.entries.pop();
+        last.bytes -= held.as_ref().map_or(0, Held::cost);
+        held
+    }
+
+    /// What its entries are counted for; those below the last one's floor are about to go.
+    pub fn bytes(&self) -> usize {
+        let last = self.last();
+        match self.floor().checked_sub(last.first) {
+            Some(below @ 1..) => last.entries.iter().skip(below as usize).map(Held::cost).sum(),
+            _ => last.bytes,
+        }
+    }
+
+    /// The first of the writer's epochs that will stay, once all is durable; 0 if all do.
+    pub fn stays(&self) -> u32 {
+        self.stays.max(self.last().stays)
+    }
+
+    /// The first of the writer's epochs that stays, as far as durable entries say so.
+    pub fn retires(&self) -> Option<u32> {
+        self.durable_entries().iter().filter_map(|held| held.retires).max()
     }
 
     /// Begins at `seq`, with nothing.
@@ -121,7 +175,12 @@ impl Log {
 
     /// Goes on at the floor `seq`, beyond the next free place, with this entry.
     pub fn jump(&mut self, seq: u32, held: Held) {
-        self.beyond = Some(Box::new(Self { entries: vec![held], ..Self::begin(seq) }));
+        self.beyond = Some(Box::new(Self {
+            bytes: held.cost(),
+            stays: held.retires.unwrap_or_default(),
+            entries: vec![held],
+            ..Self::begin(seq)
+        }));
         self.early.retain(|place, _| *place > seq);
     }
 
@@ -131,8 +190,9 @@ impl Log {
             beyond.mark(seq);
         }
         if let Some(beyond) = self.beyond.take_if(|beyond| beyond.durable > beyond.first) {
-            let Self { first, entries, durable, .. } = *beyond;
-            (self.first, self.entries, self.durable) = (first, entries, durable);
+            let Self { first, entries, durable, bytes, stays, .. } = *beyond;
+            (self.first, self.entries, self.durable, self.bytes) = (first, entries, durable, bytes);
+            self.stays = self.stays.max(stays);
         }
         self.drop_replaced();
     }
@@ -164,7 +224,8 @@ impl Log {
     fn drop_replaced(&mut self) {
         let floor = self.durable_entries().last().map_or(self.first, |held| held.floor);
         if floor > self.first {
-            self.entries.drain(..(floor - self.first) as usize);
+            let gone = self.entries.drain(..(floor - self.first) as usize);
+            self.bytes -= gone.map(|held| held.cost()).sum::<usize>();
             self.first = floor;
         }
     }

@@ -18,6 +18,9 @@ mod have;
 mod log;
 mod restore;
 mod set;
+mod shares;
+#[cfg(test)]
+mod shares_tests;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]

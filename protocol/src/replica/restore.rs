@@ -1,7 +1,7 @@
 //! Loading a store. The hash chain is checked entry by entry, the signature only of each log's last entry: it covers
 //! its predecessor's hash, hence the whole log. 36,000 entries cost one hash each and one signature a log.
 
-use super::log::{Held, Link, Log};
+use super::log::{Held, Link, Log, retires};
 use super::set::{IngestError, Ingested, Replica, Slot};
 use crate::ids::{EntryId, FrameId, Hash};
 use crate::wire::Entry;
@@ -13,12 +13,14 @@ struct Stored {
     seq: u32,
     previous: Hash,
     floor: u32,
+    retires: Option<u32>,
     bytes: Vec<u8>,
 }
 
 impl Stored {
     fn new(entry: &Entry, bytes: Vec<u8>) -> Self {
-        Self { seq: entry.id().seq, previous: entry.previous(), floor: entry.floor(), bytes }
+        let (previous, floor) = (entry.previous(), entry.floor());
+        Self { seq: entry.id().seq, previous, floor, retires: retires(entry), bytes }
     }
 }
 
@@ -92,7 +94,8 @@ impl Replica {
 
     /// Loads the longest sound prefix of the log; gives back the other records.
     fn restore_chain(&mut self, frame: FrameId, records: Vec<Stored>) -> Vec<Stored> {
-        if self.slots.contains_key(&frame) || self.check_epoch(frame).is_err() {
+        let begins = records.first().filter(|record| record.seq == 0).and_then(|record| record.retires);
+        if self.slots.contains_key(&frame) || self.check_room(frame, begins).is_err() {
             return records;
         }
         let first = records.first().filter(|record| record.floor == record.seq).map_or(0, |record| record.seq);
@@ -104,7 +107,7 @@ impl Replica {
             next && replica.check_place(EntryId { frame, seq: record.seq }, record.floor).is_ok()
         };
         while let Some(record) = records.next_if(|record| fits(self, record)) {
-            self.log_mut(frame).push(Held::new(record.bytes.into(), record.floor));
+            self.log_mut(frame).push(Held::new(record.bytes.into(), record.floor, record.retires));
         }
         let mut left = Vec::new();
         while let Some(held) = self.log_mut(frame).pop() {
@@ -124,6 +127,7 @@ impl Replica {
         if nothing {
             self.slots.remove(&frame);
         }
+        self.retire(frame);
         left.into_iter().chain(records).collect()
     }
 }

@@ -28,8 +28,14 @@ pub struct Replica {
     pub(super) roster_hash: [u8; 4],
     /// The digest, until the set changes.
     pub(super) digest: OnceCell<Hash>,
-    entries_per_frame_max: u32,
-    epochs_per_robot_max: usize,
+    /// First epoch of each robot that it has not given up, as far as it said so.
+    pub(super) retired: BTreeMap<RobotId, u32>,
+    /// Logs that were given up since the last [`Replica::take_gone`].
+    pub(super) gone: Vec<FrameId>,
+    pub(super) entries_per_frame_max: u32,
+    pub(super) epochs_per_robot_max: usize,
+    /// What a member's entries may be counted for.
+    pub(super) member_bytes_max: usize,
 }
 
 pub(super) struct Member {
@@ -80,9 +86,12 @@ pub enum IngestError {
     /// Of a robot that is not in the roster.
     #[error("robot {0} is not in the roster")]
     UnknownOrigin(RobotId),
-    /// The robot has as many epochs as are held.
-    #[error("robot {0} has more epochs than gossip.epochs_per_robot_max; raise it or retire old ones")]
+    /// The robot has as many epochs as are held, and gave none of them up first.
+    #[error("robot {0} has more epochs than gossip.epochs_per_robot_max")]
     EpochLimit(RobotId),
+    /// The robot's entries take as much as is granted to each member.
+    #[error("robot {0} has filled its share of gossip.facts_bytes_max; others are not touched")]
+    BytesLimit(RobotId),
     /// The log is as long as is held.
     #[error("entry {0} is beyond gossip.entries_per_frame_max")]
     SeqLimit(EntryId),
@@ -111,6 +120,8 @@ impl IngestError {
         match self {
             Self::FloorMoved(id) | Self::TooEarly(id) => Some(id.frame.robot),
             Self::Fork(frame) => Some(frame.robot),
+            // Only what it signed fills its share.
+            Self::BytesLimit(robot) => Some(*robot),
             Self::Entry(_)
             | Self::Swarm(_)
             | Self::UnknownOrigin(_)
@@ -128,6 +139,7 @@ impl IngestError {
             Self::Swarm(_) => "swarm",
             Self::UnknownOrigin(_) => "unknown_origin",
             Self::EpochLimit(_) => "epoch_limit",
+            Self::BytesLimit(_) => "bytes_limit",
             Self::SeqLimit(_) => "seq_limit",
             Self::FloorMoved(_) => "floor_moved",
             Self::TooEarly(_) => "too_early",
@@ -159,6 +171,7 @@ impl Replica {
         if members.len() > MEMBERS_MAX {
             return Err(RosterError::TooMany(members.len()));
         }
+        let members_count = members.len();
         let mut ids = blake3::Hasher::new();
         for robot in members.keys() {
             ids.update(&robot.0);
@@ -170,8 +183,11 @@ impl Replica {
             roster_hash: [a, b, c, d],
             digest: OnceCell::new(),
             slots: BTreeMap::new(),
+            retired: BTreeMap::new(),
+            gone: Vec::new(),
             entries_per_frame_max: limits.entries_per_frame_max,
             epochs_per_robot_max: limits.epochs_per_robot_max,
+            member_bytes_max: limits.member_bytes_max(members_count),
         })
     }
 
@@ -188,13 +204,15 @@ impl Replica {
             Some(Slot::Log(log)) if log.held(id.seq).is_some_and(|held| *held.bytes == *bytes) => {
                 return Ok(Ingested::Known);
             }
-            // The writer has replaced it.
+            // The writer has replaced it, or given it up.
             Some(Slot::Log(log)) if id.seq < log.first() => return Ok(Ingested::Known),
+            None if self.is_retired(frame) => return Ok(Ingested::Known),
             Some(Slot::Log(log)) if log.early.get(&id.seq) == Some(&entry) => return Ok(Ingested::Early(id)),
             _ => {}
         }
-        self.check_epoch(frame)?;
+        self.check_epoch(&entry)?;
         self.check_place(id, entry.floor())?;
+        self.check_bytes(&entry, bytes.len())?;
         self.verify(&entry)?;
 
         let next = self.next_seq(frame);
@@ -235,6 +253,7 @@ impl Replica {
         if let Some(Slot::Log(log)) = self.slots.get_mut(&id.frame) {
             log.mark_durable(id.seq);
             self.digest.take();
+            self.retire(id.frame);
         }
     }
 
@@ -318,18 +337,6 @@ impl Replica {
         Ok(entry)
     }
 
-    /// Whether a log of this frame is or may be held. Nobody has the last epoch of all: none could follow it.
-    pub(crate) fn check_epoch(&self, frame: FrameId) -> Result<(), IngestError> {
-        if frame.epoch == u32::MAX {
-            return Err(IngestError::EpochLimit(frame.robot));
-        }
-        let known = self.slots.contains_key(&frame);
-        if known || self.epochs_of(frame.robot).count() < self.epochs_per_robot_max {
-            return Ok(());
-        }
-        Err(IngestError::EpochLimit(frame.robot))
-    }
-
     /// Whether an entry that states this floor may be held: entries from a floor on are counted, and the last place of
     /// all stays free.
     pub(super) fn check_place(&self, id: EntryId, floor: u32) -> Result<(), IngestError> {
@@ -373,7 +380,7 @@ impl Replica {
             Link::Fits => {
                 let log = self.log_mut(id.frame);
                 log.received = true;
-                log.push(Held::new(bytes.into(), entry.floor()));
+                log.push(Held::of(entry, bytes.into()));
                 Ok(())
             }
             Link::FloorMoved => Err(IngestError::FloorMoved(id)),
@@ -393,7 +400,7 @@ impl Replica {
             return Err(self.fork(id.frame, &other, bytes)); // the same one was answered before
         }
         log.received = true;
-        log.jump(id.seq, Held::new(bytes.into(), entry.floor()));
+        log.jump(id.seq, Held::of(entry, bytes.into()));
         self.with_early(id)
     }
 

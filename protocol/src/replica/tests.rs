@@ -141,6 +141,7 @@ fn lengths_and_epochs_are_bounded_on_both_sides() {
     assert!(matches!(replica.append(&key(0), 0, &fact(3)), Err(AppendError::NewEpochNeeded(..))));
     replica.append(&key(0), 1, &fact(0)).unwrap();
     assert_eq!(replica.append(&key(0), 2, &fact(0)), Err(AppendError::EpochLimit(robot(0))), "nobody would take it");
+    assert_eq!(replica.to_retire(frame(0, 2)), Some(1), "before one of them is given up");
     assert!(replica.append(&key(0), 1, &fact(1)).is_ok());
 }
 

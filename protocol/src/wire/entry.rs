@@ -133,7 +133,7 @@ pub struct EntryContent {
 }
 
 impl Entry {
-    /// OverlapFeatures an entry.
+    /// Signs an entry.
     ///
     /// # Errors
     /// [`EntryError`] if the content is over a limit or contradicts itself.

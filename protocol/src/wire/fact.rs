@@ -24,6 +24,16 @@ pub enum Fact {
     Position(PositionFact),
     /// Two of the writer's own submaps that look alike in more ways than one.
     Lookalike(LookalikeFact),
+    /// Which of its epochs the writer gives up.
+    Retired(RetiredFact),
+}
+
+/// The writer gives up its epochs below one: their logs are gone on every robot that hears of it, as if they had never
+/// been. It cannot give up the epoch that it says so in, or one to come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RetiredFact {
+    /// The first epoch that stays.
+    pub below: NonZero<u32>,
 }
 
 /// A submap, as its owner states it.

@@ -127,6 +127,7 @@ fn fact(of: &Fact) -> Value {
             "covariance": upper_triangle(f.covariance.matrix()),
         }),
         Fact::Lookalike(f) => json!({ "i": f.i, "j": f.j }),
+        Fact::Retired(f) => json!({ "below": f.below }),
         Fact::Condensed(f) => json!({
             "carried": f.carried.iter().map(|one| json!({
                 "seq": one.seq,

@@ -4,8 +4,8 @@
 
 use super::condensed::RawCondensed;
 use super::fact::{
-    AlignmentFact, Fact, LookalikeFact, PositionFact, RefusalReason, ScaleKind, SightingFact, SubmapFact, VerdictFact,
-    VerdictOutcome,
+    AlignmentFact, Fact, LookalikeFact, PositionFact, RefusalReason, RetiredFact, ScaleKind, SightingFact, SubmapFact,
+    VerdictFact, VerdictOutcome,
 };
 use super::frame::to_bytes;
 use super::limits::{self, LENGTH_MAX, PAYLOAD_LEN_MAX, SUMMARY_LEN_MAX};
@@ -31,6 +31,8 @@ pub const KIND_CONDENSED: u8 = 5;
 pub const KIND_POSITION: u8 = 6;
 /// Entry kind of a [`LookalikeFact`].
 pub const KIND_LOOKALIKE: u8 = 7;
+/// Entry kind of a [`RetiredFact`].
+pub const KIND_RETIRED: u8 = 8;
 
 /// Why a payload is no fact, or a fact cannot be written. No state changes.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -94,6 +96,7 @@ impl Fact {
             Self::Condensed(_) => KIND_CONDENSED,
             Self::Position(_) => KIND_POSITION,
             Self::Lookalike(_) => KIND_LOOKALIKE,
+            Self::Retired(_) => KIND_RETIRED,
         }
     }
 
@@ -107,6 +110,7 @@ impl Fact {
             KIND_CONDENSED => "condensed",
             KIND_POSITION => "position",
             KIND_LOOKALIKE => "lookalike",
+            KIND_RETIRED => "retired",
             _ => "unknown",
         }
     }
@@ -157,6 +161,7 @@ enum Raw {
     Condensed(RawCondensed),
     Position(RawPosition),
     Lookalike(RawLookalike),
+    Retired(NonZero<u32>),
 }
 
 impl Raw {
@@ -169,6 +174,7 @@ impl Raw {
             Fact::Condensed(f) => Self::Condensed(RawCondensed::of(f)?),
             Fact::Position(f) => Self::Position(RawPosition::of(f)?),
             Fact::Lookalike(f) => Self::Lookalike(RawLookalike::of(f)?),
+            Fact::Retired(f) => Self::Retired(f.below),
         })
     }
 
@@ -181,6 +187,7 @@ impl Raw {
             Self::Condensed(raw) => Fact::Condensed(raw.parse()?),
             Self::Position(raw) => Fact::Position(raw.parse()?),
             Self::Lookalike(raw) => Fact::Lookalike(raw.parse()?),
+            Self::Retired(below) => Fact::Retired(RetiredFact { below: *below }),
         })
     }
 
@@ -194,6 +201,7 @@ impl Raw {
             Self::Condensed(raw) => to_bytes(raw),
             Self::Position(raw) => to_bytes(raw),
             Self::Lookalike(raw) => to_bytes(raw),
+            Self::Retired(below) => to_bytes(below),
         }
     }
 
@@ -206,6 +214,7 @@ impl Raw {
             KIND_CONDENSED => Self::Condensed(whole(bytes)?),
             KIND_POSITION => Self::Position(whole(bytes)?),
             KIND_LOOKALIKE => Self::Lookalike(whole(bytes)?),
+            KIND_RETIRED => Self::Retired(whole(bytes)?),
             other => return Err(FactError::UnknownKind(other)),
         })
     }

@@ -124,6 +124,7 @@ samples! {
             })
         }
         Fact::Lookalike(_) => { "lookalike" => Fact::Lookalike(LookalikeFact { i: 7, j: 300 }) }
+        Fact::Retired(_) => { "retired" => Fact::Retired(RetiredFact { below: NonZero::new(300).unwrap() }) }
         Fact::Submap(SubmapFact { scale: ScaleKind::Metric, keyframes: Some(_), .. }) => {
             "submap_counted" => counted(submap_fact(ScaleKind::Metric))
         }

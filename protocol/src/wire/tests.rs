@@ -359,7 +359,8 @@ fn fact() -> impl Strategy<Value = Fact> {
     });
     let lookalike = (0..u32::MAX).prop_flat_map(|i| (Just(i), i + 1..=u32::MAX));
     let lookalike = lookalike.prop_map(|(i, j)| Fact::Lookalike(LookalikeFact { i, j }));
-    prop_oneof![submap, alignment, verdict, sighting, position, lookalike]
+    let retired = any::<NonZero<u32>>().prop_map(|below| Fact::Retired(RetiredFact { below }));
+    prop_oneof![submap, alignment, verdict, sighting, position, lookalike, retired]
 }
 
 proptest! {

@@ -270,12 +270,17 @@ fn put(disk: &mut Vec<Record>, record: Record) {
     if let Record::Refused { i, j, .. } = record {
         disk.retain(|other| !matches!(other, Record::Refused { i: a, j: b, .. } if (*a, *b) == (i, j)));
     }
-    let Record::Replaced { below, submaps, blobs } = record else {
-        let stays = !matches!(record, Record::Refused { evidence: None, .. });
-        return disk.extend(stays.then_some(record));
+    let (frame, below, submaps, blobs) = match record {
+        Record::Replaced { below, submaps, blobs } => (below.frame, Some(below.seq), submaps, blobs),
+        Record::Retired { frame, submaps, blobs } => (frame, None, submaps, blobs),
+        record => {
+            let stays = !matches!(record, Record::Refused { evidence: None, .. });
+            return disk.extend(stays.then_some(record));
+        }
     };
     disk.retain(|record| match record {
-        Record::Entry { id, .. } => id.frame != below.frame || id.seq >= below.seq,
+        Record::Entry { id, .. } => id.frame != frame || below.is_some_and(|below| id.seq >= below),
+        Record::Fork { frame: of, .. } => *of != frame || below.is_some(),
         Record::Private { submap, .. } => !submaps.contains(submap),
         Record::Blob { hash, .. } => !blobs.contains(hash),
         _ => true,

@@ -7,9 +7,9 @@ use merganser_protocol::ids::{EntryId, FrameId};
 use merganser_protocol::replica::{EARLY_PER_ROBOT_MAX, Replica};
 use merganser_protocol::submap::Keyframe;
 use merganser_protocol::time::{Instant, Stamp};
-use merganser_protocol::wire::EntryBytes;
 use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
 use merganser_protocol::wire::messages::Message;
+use merganser_protocol::wire::{Entry, EntryBytes};
 use std::time::Duration;
 
 fn drain(agent: &mut Agent) -> Vec<Output> {
@@ -55,34 +55,74 @@ fn writes(wires: &mut Wires) {
     assert!(wires.agents[0].status().submaps > 1 && !rejected.contains_key("own fact"), "{rejected:?}");
 }
 
+/// Each start of a SLAM is like the second: the oldest epoch goes, here and where it was heard, off the disks too.
 #[test]
-fn a_robot_at_its_last_epoch_writes_and_beyond_it_only_listens_and_says_why() {
+fn a_robot_that_begins_ever_new_epochs_goes_on_and_gives_up_its_oldest() {
     let (keyframes, _) = drive(&World::new(1), 0, 8);
     let mut config = super::common::config();
     config.gossip.epochs_per_robot_max = 2;
-    let mut wires = Wires::new(vec![super::common::agent_of(0, &config)]);
-    let drive_and_end = |wires: &mut Wires| {
+    let pair = [0, 1].map(|n| super::common::agent_of(n, &config));
+    let mut wires = Wires::new(pair.into());
+    for round in 1..=5_usize {
         keyframes.iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe.clone())));
         wires.input(0, Input::Command(Command::NewEpoch));
+        wires.run(Duration::from_secs(5));
+        let status = wires.agents[0].status();
+        assert_eq!((status.receive_only, status.keyframes), (false, 8 * round as u64));
+        for robot in 0..2 {
+            assert_eq!(wires.agents[robot].heads().count(), round.min(2), "round {round}, robot {robot}");
+            let frames: std::collections::BTreeSet<FrameId> = wires.disks[robot].iter().filter_map(frame_of).collect();
+            assert_eq!(frames.len(), round.min(2), "on the disk of {robot}: {frames:?}");
+        }
+    }
+    assert!(!is_told(&wires));
+    let gone = |k: usize| {
+        let of = |(agent, event): &(usize, Event)| match event {
+            Event::EpochsRetired { robot, count, .. } => (*agent == k && robot == "alpha").then_some(*count),
+            _ => None,
+        };
+        wires.events.iter().filter_map(of).collect::<Vec<_>>()
     };
-    drive_and_end(&mut wires);
-    assert!(!wires.agents[0].status().receive_only && !is_told(&wires), "the second epoch is its last");
-    drive_and_end(&mut wires);
-    assert_eq!(wires.agents[0].heads().count(), 2);
-    assert!(wires.agents[0].status().receive_only && is_told(&wires));
-    let (kept, taken) = (wires.disks[0].len(), wires.agents[0].status().keyframes);
-    drive_and_end(&mut wires);
-    let status = wires.agents[0].status();
-    assert_eq!((wires.disks[0].len(), status.keyframes, status.unsaved), (kept + 1, taken, 0), "but the epoch's end");
-    let refused = wires.agents[0].snapshot(wires.now).stats.rejected["keyframe: receive-only"];
-    assert_eq!(refused, keyframes.len() as u64);
-    // What others write is heard and kept.
-    let other = agent(1, Restored::default());
-    wires = Wires::new(vec![wires.agents.remove(0), other]);
-    keyframes.iter().for_each(|keyframe| wires.input(1, Input::Keyframe(keyframe.clone())));
-    wires.input(1, Input::Command(Command::Flush));
-    wires.run(Duration::from_secs(5));
-    assert_eq!(wires.agents[0].heads().count(), 3);
+    // The last alignments of the fifth are stated in the sixth.
+    assert_eq!((gone(0), gone(1)), (vec![1; 4], vec![1; 4]));
+    assert_eq!(wires.agents[0].digest(), wires.agents[1].digest());
+    // A restart finds what was left.
+    let records = wires.disks[1].clone();
+    let beta = Agent::new(config, super::common::identity(1), 0, Restored { records, fresh_epoch: 2 }, wires.now);
+    assert_eq!(beta.unwrap().digest(), wires.agents[0].digest());
+}
+
+/// The frame that a record belongs to.
+fn frame_of(record: &Record) -> Option<FrameId> {
+    match record {
+        Record::Entry { id, .. } => Some(id.frame),
+        Record::Private { submap, .. } => Some(submap.frame),
+        Record::Fork { frame, .. } => Some(*frame),
+        _ => None,
+    }
+}
+
+/// What was given up stays so when the log that says it is replaced.
+#[test]
+fn a_log_that_is_condensed_says_again_what_was_given_up() {
+    let (mut keyframes, _) = drive(&World::new(1), 0, 54);
+    keyframes.iter_mut().for_each(|keyframe| keyframe.points.truncate(20)); // fog: nothing ties submaps to one another
+    let mut config = super::common::config();
+    config.submap.distance_m = 1.0;
+    (config.gossip.epochs_per_robot_max, config.gossip.condense_entries) = (1, 12);
+    let mut wires = Wires::new(vec![super::common::agent_of(0, &config)]);
+    keyframes[..8].iter().for_each(|keyframe| wires.input(0, Input::Keyframe(keyframe.clone())));
+    wires.input(0, Input::Command(Command::NewEpoch));
+    for keyframe in &keyframes[8..] {
+        wires.input(0, Input::Keyframe(keyframe.clone()));
+        wires.run(Duration::from_secs(1));
+    }
+    assert!(wires.events.iter().any(|(_, event)| matches!(event, Event::Condensed { .. })), "{:?}", wires.events);
+    let retired = |record: &Record| match record {
+        Record::Entry { bytes, .. } => matches!(Entry::decode(bytes).unwrap().fact(), Ok(Fact::Retired(_))),
+        _ => false,
+    };
+    assert_eq!(wires.disks[0].iter().filter(|record| retired(record)).count(), 1);
 }
 
 #[test]
@@ -139,23 +179,35 @@ fn an_own_past_with_two_histories_is_closed_whoever_proves_it() {
     assert_eq!(wires.agents[0].frame().epoch, 12);
 }
 
+/// A store was lost, and more of the past comes back than there is room for: what is written is taken by others all the
+/// same.
 #[test]
-fn own_epochs_that_come_back_can_be_too_many_which_is_told_once() {
+fn own_epochs_that_come_back_in_any_number_hinder_nobody() {
     let mut config = super::common::config();
     config.gossip.epochs_per_robot_max = 2;
     let restored = Restored { records: vec![], fresh_epoch: 12 };
-    let alpha = Agent::new(config, super::common::identity(0), 0, restored, Instant::ZERO).unwrap();
+    let alpha = Agent::new(config.clone(), super::common::identity(0), 0, restored, Instant::ZERO).unwrap();
     let mut wires = Wires::new(vec![alpha]);
-    hear(&mut wires, &past(3, 0..2));
-    assert!(!wires.agents[0].status().receive_only && !is_told(&wires));
-    for _ in 0..2 {
-        hear(&mut wires, &past(4, 0..2));
+    writes(&mut wires);
+    for epoch in 3..8 {
+        hear(&mut wires, &past(epoch, 0..2));
     }
-    let status = wires.agents[0].status();
-    assert!(status.receive_only);
-    assert_eq!((wires.agents[0].frame().epoch, status.entries), (12, 4));
-    let told = wires.events.iter().filter(|(_, event)| matches!(event, Event::ReceiveOnly { .. })).count();
-    assert_eq!(told, 1, "{:?}", wires.events);
+    let epoch = wires.agents[0].frame().epoch;
+    assert!(epoch > 12 && !is_told(&wires), "{epoch}");
+    writes(&mut wires);
+    // Who holds as much of the past as there is room for, and nothing of what alpha wrote since.
+    let mut records = Vec::new();
+    for epoch in [6, 7] {
+        let entry =
+            |(seq, bytes)| Record::Entry { id: EntryId { frame: FrameId { robot: robot(0), epoch }, seq }, bytes };
+        records.extend((0..).zip(past(epoch, 0..2)).map(entry));
+    }
+    let restored = Restored { records, fresh_epoch: 2 };
+    let beta = Agent::new(config, super::common::identity(1), 0, restored, Instant::ZERO).unwrap();
+    wires = Wires::new(vec![wires.agents.remove(0), beta]);
+    wires.run(Duration::from_secs(20));
+    assert_eq!(wires.agents[0].digest(), wires.agents[1].digest());
+    assert!(wires.agents[1].heads().any(|(frame, _)| frame.epoch == epoch), "what alpha wrote last");
 }
 
 #[test]

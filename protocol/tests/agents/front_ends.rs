@@ -136,7 +136,7 @@ fn two_sessions_that_take_turns_begin_one_epoch() {
 }
 
 #[test]
-fn beyond_its_last_epoch_a_robot_that_restarts_is_only_refused() {
+fn a_robot_that_restarts_beyond_its_last_epoch_goes_on() {
     let mut config = super::common::config();
     config.gossip.epochs_per_robot_max = 1;
     let mut wires = Wires::new(vec![super::common::agent_of(0, &config)]);
@@ -146,7 +146,8 @@ fn beyond_its_last_epoch_a_robot_that_restarts_is_only_refused() {
         wires.run(Duration::from_secs(1));
     }
     let status = wires.agents[0].status();
-    assert_eq!((begun(&wires).len(), status.receive_only, status.keyframes), (1, true, 21));
+    assert_eq!((begun(&wires).len(), status.receive_only), (1, false));
+    assert!(status.keyframes > 28, "{}", status.keyframes);
 }
 
 /// Whatever lost a keyframe, the shell or the core: the motion across says so, it is counted, and told once.

@@ -76,12 +76,17 @@ impl Shell {
         if let Record::Refused { i, j, .. } = record {
             self.disk.retain(|other| !matches!(other, Record::Refused { i: a, j: b, .. } if (*a, *b) == (i, j)));
         }
-        let Record::Replaced { below, submaps, blobs } = record else {
-            let stays = !matches!(record, Record::Refused { evidence: None, .. });
-            return self.disk.extend(stays.then_some(record));
+        let (frame, below, submaps, blobs) = match record {
+            Record::Replaced { below, submaps, blobs } => (below.frame, Some(below.seq), submaps, blobs),
+            Record::Retired { frame, submaps, blobs } => (frame, None, submaps, blobs),
+            record => {
+                let stays = !matches!(record, Record::Refused { evidence: None, .. });
+                return self.disk.extend(stays.then_some(record));
+            }
         };
         self.disk.retain(|record| match record {
-            Record::Entry { id, .. } => id.frame != below.frame || id.seq >= below.seq,
+            Record::Entry { id, .. } => id.frame != frame || below.is_some_and(|below| id.seq >= below),
+            Record::Fork { frame: of, .. } => *of != frame || below.is_some(),
             Record::Private { submap, .. } => !submaps.contains(submap),
             Record::Blob { hash, .. } => !blobs.contains(hash),
             _ => true,
@@ -235,6 +240,6 @@ fn check_record(record: &Record) {
         Record::Session { over, .. } => assert!(over.len() <= SESSIONS_OVER_MAX),
         // One with a turned byte may be no pair: it goes off the disk under the name that it has.
         Record::Refused { i, j, evidence } => assert!(evidence.is_none() || i < j),
-        Record::Private { .. } | Record::EpochClosed { .. } | Record::Replaced { .. } => {}
+        Record::Private { .. } | Record::EpochClosed { .. } | Record::Replaced { .. } | Record::Retired { .. } => {}
     }
 }

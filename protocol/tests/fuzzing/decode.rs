@@ -113,6 +113,7 @@ fn check_fact(kind: u8, payload: &[u8], meter: &impl Meter) {
             assert!(f.covariance.matrix().symmetric_eigenvalues().min() > 0.0);
         }
         Fact::Lookalike(f) => assert!(f.i < f.j),
+        Fact::Retired(f) => assert!(f.below.get() > 0),
         Fact::Condensed(f) => {
             assert!((1..=CARRIED_MAX).contains(&f.carried.len()) && f.carried.is_sorted_by(|a, b| a.seq < b.seq));
             for one in f.carried {

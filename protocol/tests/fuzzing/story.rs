@@ -353,7 +353,7 @@ impl<'m, M: Meter> Story<'m, M> {
                 Record::Session { session, over, .. } => over.push(core::mem::replace(session, u64::from(r.byte()))),
                 Record::Refused { i, j, .. } if r.one_in(2) => core::mem::swap(i, j),
                 Record::Refused { evidence, .. } => *evidence = evidence.map(|evidence| evidence ^ 1),
-                Record::EpochClosed { .. } | Record::Replaced { .. } => {}
+                Record::EpochClosed { .. } | Record::Replaced { .. } | Record::Retired { .. } => {}
             }
             records.iter_mut().filter(|other| *other == record).for_each(|other| other.clone_from(&damaged));
         }

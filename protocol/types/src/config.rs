@@ -249,8 +249,21 @@ pub struct GossipConfig {
     pub condense_entries: u32,
     /// Entries held per robot and epoch at most.
     pub entries_per_frame_max: u32,
-    /// Epochs held per robot at most.
+    /// Epochs held per robot at most. A robot that begins one more gives up its oldest.
     pub epochs_per_robot_max: usize,
+    /// Bytes of entries held at most, in memory and on disk: each robot of the roster may fill an equal share of it, of
+    /// [`MEMBER_BYTES_MIN`] at least.
+    pub facts_bytes_max: usize,
+}
+
+/// Least share of a member in `gossip.facts_bytes_max`, bytes: some thirty entries of the largest size.
+pub const MEMBER_BYTES_MIN: usize = 1 << 16;
+
+impl GossipConfig {
+    /// What the entries of one of so many members may be counted for, bytes.
+    pub fn member_bytes_max(&self, members: usize) -> usize {
+        (self.facts_bytes_max / members.max(1)).max(MEMBER_BYTES_MIN)
+    }
 }
 
 impl Default for GossipConfig {
@@ -265,6 +278,7 @@ impl Default for GossipConfig {
             condense_entries: 1_000,
             entries_per_frame_max: 100_000,
             epochs_per_robot_max: 64,
+            facts_bytes_max: 128 << 20,
         }
     }
 }
@@ -334,6 +348,7 @@ impl Config {
         range("gossip.answer_secs", g.answer_secs, 0.01, 600.0, "use 0.01 to 600 s")?;
         range("gossip.condense_entries", f64::from(g.condense_entries), 0.0, 1e7, "use 0 (never) to 10000000")?;
         range("gossip.entries_per_frame_max", f64::from(g.entries_per_frame_max), 1.0, 1e7, "use 1 to 10000000")?;
-        range("gossip.epochs_per_robot_max", g.epochs_per_robot_max as f64, 1.0, 1e4, "use 1 to 10000")
+        range("gossip.epochs_per_robot_max", g.epochs_per_robot_max as f64, 1.0, 1e4, "use 1 to 10000")?;
+        range("gossip.facts_bytes_max", g.facts_bytes_max as f64, 65_536.0, 1e11, "use 65536 to 1e11 bytes")
     }
 }

@@ -98,7 +98,7 @@ fn sendable(record: &Record, doubted: &BTreeSet<RobotId>) -> Option<Vec<u8>> {
             (bytes.len() >= RECORD_LEN_MIN).then(|| bytes.clone())
         }
         Record::Private { .. } | Record::Fork { .. } | Record::EpochClosed { .. } | Record::Replaced { .. } => None,
-        Record::Session { .. } | Record::Refused { .. } => None,
+        Record::Session { .. } | Record::Refused { .. } | Record::Retired { .. } => None,
     }
 }
 

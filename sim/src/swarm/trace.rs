@@ -114,6 +114,7 @@ fn records_digest(records: &[Record]) -> [u8; 32] {
             Record::Session { epoch, session, over } => (format!("session {epoch}: {session} {over:?}"), &[][..]),
             Record::Refused { i, j, evidence } => (format!("refused {i} {j}: {evidence:?}"), &[][..]),
             Record::Replaced { below, submaps, blobs } => (format!("below {below}: {submaps:?} {blobs:?}"), &[][..]),
+            Record::Retired { frame, submaps, blobs } => (format!("retired {frame}: {submaps:?} {blobs:?}"), &[][..]),
         };
         for part in [kind.as_bytes(), bytes] {
             hasher.update(&(part.len() as u64).to_le_bytes());

@@ -116,7 +116,7 @@ impl Alignment {
                     self.on_fact(context, sources, EntryId { seq: one.seq, ..id }, &one.fact);
                 }
             }
-            Fact::Sighting(_) | Fact::Position(_) | Fact::Lookalike(_) => {}
+            Fact::Sighting(_) | Fact::Position(_) | Fact::Lookalike(_) | Fact::Retired(_) => {}
         }
     }
 

@@ -48,7 +48,9 @@ impl Replication {
         let wanted = context.config().gossip.condense_entries;
         let held = self.replica.settled(frame)?;
         let count = held.end - held.start;
-        if wanted == 0 || self.is_receive_only(context) || count < wanted.max(self.condensing.again_at) {
+        let is_crowded = self.replica.bytes_of(frame.robot) > self.replica.member_bytes_max() / 4 * 3;
+        let due = self.condensing.again_at.max(if is_crowded { 0 } else { wanted });
+        if wanted == 0 || self.is_receive_only(context) || count < due {
             return None;
         }
         self.condensing.again_at = count.saturating_mul(2);
@@ -62,7 +64,13 @@ impl Replication {
             return None;
         }
         match self.replica.append_floor(&context.me().key, frame.epoch, &shorter.parts) {
-            Ok(new) => self.replace(context, &new, &shorter.gone, [before, after]),
+            Ok(mut new) => {
+                // What was given up stays so, also for those who hear of the log from here on only.
+                let retired = self.retired(frame.robot);
+                let said = retired.map(|fact| self.replica.append(&context.me().key, frame.epoch, &fact));
+                new.extend(said.and_then(Result::ok));
+                self.replace(context, &new, &shorter.gone, [before, after])
+            }
             Err(error) => {
                 context.reject(Some(context.robot()), "own fact: condensed", &error.to_string());
                 None
@@ -113,6 +121,8 @@ pub(super) fn shorten(frame: FrameId, entries: &[Entry], knowledge: &Knowledge) 
                 // Of two that claim one index, the one written first counts.
                 chain.entry(submap.index).or_insert(Step { seq, after, submap });
             }
+            // Said again, in an entry of its own.
+            Fact::Retired(_) => {}
             // To whom it was an answer, it is one no more.
             Fact::Verdict(verdict) if knowledge.alignment(verdict.alignment).is_none() => {}
             fact => carried.push(CarriedFact { seq, after: None, fact }),

@@ -131,6 +131,8 @@ impl Knowledge {
             Fact::Lookalike(pair) => {
                 self.lookalikes.insert(id, pair);
             }
+            // The replica acts on it.
+            Fact::Retired(_) => {}
         }
     }
 

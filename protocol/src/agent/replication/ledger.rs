@@ -53,6 +53,8 @@ pub(in crate::agent) enum Heard {
     Early(FrameId),
     /// It proves that the log has two histories.
     Forked(FrameId),
+    /// It is of an own log that there is no room for.
+    Crowded,
     /// Nothing changed.
     Nothing,
 }
@@ -69,6 +71,16 @@ impl Replication {
     /// Writes a fact of our own; it takes effect once it is durable. While the store fails, no work is begun that ends
     /// here; what was under way waits for the disk with the rest.
     pub(in crate::agent) fn write(&mut self, context: &mut Context, epoch: u32, fact: &Fact) -> Written {
+        if let Some(retired) = self.to_retire(context, epoch) {
+            match self.write_one(context, epoch, &retired) {
+                Written::Yes => {}
+                hindered => return hindered,
+            }
+        }
+        self.write_one(context, epoch, fact)
+    }
+
+    fn write_one(&mut self, context: &mut Context, epoch: u32, fact: &Fact) -> Written {
         match self.replica.append(&context.me().key, epoch, fact) {
             Ok(entry) => {
                 context.keep(Record::Entry { id: entry.id(), bytes: entry.encode() });
@@ -97,6 +109,9 @@ impl Replication {
             }
             Err(error) => {
                 refuse(context, from, &error);
+                if matches!(error, IngestError::EpochLimit(robot) if robot == context.robot()) {
+                    return Heard::Crowded;
+                }
                 if let IngestError::TooEarly(id) = error { Heard::Early(id.frame) } else { Heard::Nothing }
             }
         }

@@ -13,6 +13,7 @@ pub(super) mod copies;
 mod gossip;
 pub(super) mod knowledge;
 mod ledger;
+mod retiring;
 mod traffic;
 
 pub use blobs::BLOBS_MAX;
@@ -189,9 +190,9 @@ impl Replication {
         self.store_fails() || self.epoch_limit(context).is_some()
     }
 
-    /// Why others would refuse a fact of our epoch, if they would.
+    /// Why others would refuse a fact of our epoch, if they would: none can follow the last epoch of all.
     pub(super) fn epoch_limit(&self, context: &Context) -> Option<AppendError> {
-        self.replica.check_epoch(context.frame()).err().map(|_| AppendError::EpochLimit(context.robot()))
+        (context.frame().epoch == u32::MAX).then(|| AppendError::EpochLimit(context.robot()))
     }
 
     /// Robots that are reachable now.
