@@ -9,7 +9,7 @@ with zenoh.open(config) as session, session.declare_subscriber("merganser/v1/*/*
     for sample in poses:
         observer = str(sample.key_expr).split("/")[3]
         for robot in json.loads(sample.payload.to_string())["robots"]:
-            if robot["t_own_body"]:
+            if robot["live"] and robot["t_own_body"]:
                 x, sigmas = robot["t_own_body"]["pose"]["translation"], robot["t_own_body"]["sigmas"]
                 pose = "  ".join(f"{n} {v:+8.3f} ± {s:.3f} m" for n, v, s in zip("xyz", x, sigmas))
                 print(f"{observer} sees {robot['robot']:8} at {pose}", flush=True)

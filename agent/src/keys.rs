@@ -16,7 +16,7 @@ pub const PREFIX: &str = "merganser/v1";
 /// All broadcast channels.
 pub const CHANNELS: [Channel; 3] = [Channel::Pose, Channel::Facts, Channel::Have];
 /// All questions between robots.
-pub const QUERIES: [QueryKind; 3] = [QueryKind::Sync, QueryKind::Blob, QueryKind::Align];
+pub const QUERIES: [QueryKind; 4] = [QueryKind::Sync, QueryKind::Blob, QueryKind::Align, QueryKind::Life];
 /// All views, as in `…/view/{name}`.
 pub const VIEWS: [&str; 7] = ["status", "frames", "poses", "map", "path", "graph", "stats"];
 /// Last part of a robot's liveliness key.
@@ -39,6 +39,7 @@ pub fn query(kind: QueryKind) -> &'static str {
         QueryKind::Sync => "sync",
         QueryKind::Blob => "blob",
         QueryKind::Align => "align",
+        QueryKind::Life => "life",
     }
 }
 
@@ -71,7 +72,7 @@ pub fn priority(channel: Channel) -> Priority {
 /// Priority of a question and its answer.
 pub fn query_priority(kind: QueryKind) -> Priority {
     match kind {
-        QueryKind::Sync | QueryKind::Align => Priority::Data,
+        QueryKind::Sync | QueryKind::Align | QueryKind::Life => Priority::Data,
         QueryKind::Blob => Priority::DataLow,
     }
 }
@@ -91,6 +92,7 @@ pub fn query_encoding(kind: QueryKind) -> Encoding {
         QueryKind::Sync => "Sync",
         QueryKind::Blob => "Blob",
         QueryKind::Align => "Align",
+        QueryKind::Life => "Life",
     })
 }
 

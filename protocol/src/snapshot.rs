@@ -204,12 +204,16 @@ pub struct RobotPairView {
     pub t_a_b: RelationView,
 }
 
-/// A live robot.
+/// A robot whose beacons were heard.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RobotView {
     /// Its name.
     pub robot: String,
-    /// Seconds since its last beacon (or keyframe).
+    /// Whether it is known to be there: it answered since we listen, and its beacons go on. If not, the rest tells where
+    /// it was last known to be: what is heard of it may have been recorded.
+    #[serde(default)]
+    pub live: bool,
+    /// Seconds since its last beacon (or keyframe); if it is not live, since it last was, or since we listen.
     pub age_secs: f64,
     /// Its stamp, s, on its own clock.
     pub stamp_secs: f64,

@@ -121,6 +121,8 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
         // A robot that is not there yet must not keep this one from starting.
         ("connect/timeout_ms", json!({"router": -1, "peer": -1, "client": 10_000})),
         ("connect/exit_on_failure", json!({"router": false, "peer": false, "client": true})),
+        // A robot waits for nobody when it starts; else Zenoh warns each time that nobody was found yet.
+        ("open/return_conditions/connect_scouted", json!(role == Role::Onlooker)),
         ("connect/retry", json!({"period_init_ms": 250, "period_max_ms": 4000, "period_increase_factor": 2.0})),
         ("scouting/multicast/enabled", json!(config.multicast)),
         ("scouting/multicast/interface", json!(config.interface)),
@@ -143,7 +145,10 @@ fn entry_settings(config: &ZenohConfig, entry: &Entry<'_>) -> Result<Config, Lin
         ("listen/endpoints", json!(entry.endpoints)),
         ("connect/endpoints", json!([])),
         ("scouting/multicast/enabled", json!(false)),
-        ("scouting/gossip/enabled", json!(false)),
+        // Without gossip Zenoh warns at each start; so it is on, and goes to nobody.
+        ("scouting/gossip/target", json!({"router": [], "peer": []})),
+        ("scouting/gossip/autoconnect", json!({"router": [], "peer": []})),
+        ("open/return_conditions/connect_scouted", json!(false)),
         ("transport/link/tx/lease", json!((config.lease_secs * 1e3) as u64)),
         ("transport/link/rx/max_message_size", json!(config.input_bytes_max + INPUT_SLACK_BYTES)),
         ("transport/shared_memory/enabled", json!(false)),
@@ -304,7 +309,9 @@ mod tests {
         let config = ZenohConfig { input_users_file: Some("/x/users".into()), ..ZenohConfig::default() };
         let settings = entry_settings(&config, &entry).unwrap();
         let of = |key: &str| settings.get_json(key).unwrap();
-        assert_eq!((of("scouting/multicast/enabled"), of("scouting/gossip/enabled")), ("false".into(), "false".into()));
+        assert_eq!((of("scouting/multicast/enabled"), of("connect/endpoints")), ("false".into(), "[]".into()));
+        assert_eq!(of("scouting/gossip/target"), of("scouting/gossip/autoconnect"));
+        assert_eq!(of("scouting/gossip/target"), r#"{"router":[],"peer":[]}"#);
         assert_eq!(of("transport/link/rx/max_message_size"), "6356992");
         assert!(of("access_control").contains("merganser/v1/demo/alpha/in/*"));
         assert_eq!(of("transport/auth/usrpwd/dictionary_file"), "\"/x/users\"");

@@ -13,15 +13,18 @@ use merganser_protocol::ids::{EntryId, FrameId, RobotId, SubmapId};
 use merganser_protocol::replica::{IngestError, Ingested, Replica, VectorForm};
 use merganser_protocol::snapshot::{StatsView, StatusView};
 use merganser_protocol::time::Stamp;
-use merganser_protocol::wire::{Beacon, BeaconContent, Entry, Message};
+use merganser_protocol::wire::{Beacon, BeaconAge, BeaconContent, Entry, Life, LifeContent, Message, SwarmTag};
 use serde::de::DeserializeOwned;
 use std::fs::File;
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{self, Receiver};
 use std::time::Duration;
 use zenoh::Session;
 use zenoh::bytes::Encoding;
+use zenoh::query::Query;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_merganser");
 /// Longest wait for one answer.
@@ -38,7 +41,8 @@ pub struct Outsider {
     pub replica: Replica,
     /// What was told since the last [`Outsider::take_told`].
     told: Vec<(EntryId, Vec<u8>)>,
-    beacons: u64,
+    /// Beacons that it sent.
+    beacons: Arc<AtomicU64>,
 }
 
 impl Outsider {
@@ -53,6 +57,22 @@ impl Outsider {
         });
         subscriber.background().await.unwrap();
         let secret = SecretKey::load(&config.key_file).unwrap();
+        let beacons = Arc::new(AtomicU64::new(0));
+        let (key, sent) = (ed25519_dalek::SigningKey::from_bytes(&secret.to_bytes()), beacons.clone());
+        let swarm = SwarmTag::of(&config.swarm);
+        let is_there = move |query: Query| {
+            use zenoh::Wait as _;
+            let Ok(Message::LifeRequest { nonce }) = Message::decode(&query.payload().unwrap().to_bytes()) else {
+                return;
+            };
+            let counter = sent.load(Relaxed);
+            let latest = BeaconAge { epoch: 1, stamp: Stamp(counter as i64), counter };
+            let robot = RobotId::of_key(key.verifying_key().as_bytes());
+            let life = Life::sign(&key, swarm, LifeContent { robot, nonce, latest: Some(latest) });
+            query.reply(query.key_expr().clone(), Message::LifeReply(life).encode()).wait().unwrap();
+        };
+        let life = keys::of(&config.swarm, &config.robot, keys::query(QueryKind::Life));
+        session.declare_queryable(life).callback(is_there).background().await.unwrap();
         let roster = config.roster.iter().map(|(name, key)| (name.clone(), key.to_bytes()));
         Self {
             session,
@@ -62,7 +82,7 @@ impl Outsider {
             heard,
             replica: Replica::new(&config.swarm, roster, &config.core.gossip).unwrap(),
             told: Vec::new(),
-            beacons: 0,
+            beacons,
         }
     }
 
@@ -156,12 +176,12 @@ impl Outsider {
 
     /// Tells all where it is, so that it can be sighted.
     pub async fn beacon(&mut self) {
-        self.beacons += 1;
+        let counter = self.beacons.fetch_add(1, Relaxed) + 1;
         let covariance = Covariance::from_sigmas([0.01; 6]).unwrap();
         let content = BeaconContent {
             anchor: SubmapId { frame: FrameId { robot: self.me, epoch: 1 }, index: 0 },
-            stamp: Stamp(self.beacons as i64),
-            counter: self.beacons,
+            stamp: Stamp(counter as i64),
+            counter,
             t_anchor_body: PoseWithCovariance { pose: Se3::identity(), covariance },
         };
         let beacon = Beacon::sign(&self.key, self.replica.swarm(), &content).unwrap();

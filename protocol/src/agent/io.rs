@@ -20,7 +20,7 @@ pub enum Channel {
     Have,
 }
 
-/// The three questions one robot asks another.
+/// The questions one robot asks another.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum QueryKind {
@@ -30,6 +30,8 @@ pub enum QueryKind {
     Blob,
     /// "I think these two submaps overlap; please look."
     Align,
+    /// "Are you there now?"
+    Life,
 }
 
 /// A question of ours, chosen by the core; unique within one run of an agent.

@@ -6,7 +6,7 @@ use super::fork::ForkProof;
 use super::log::{Held, Link, Log};
 use crate::config::GossipConfig;
 use crate::ids::{EntryId, FrameId, Hash, Name, RobotId};
-use crate::wire::{Beacon, Entry, EntryError, Fact, SwarmTag};
+use crate::wire::{Beacon, Entry, EntryError, Fact, Life, SwarmTag};
 use core::cell::OnceCell;
 use core::ops::Range;
 use ed25519_dalek::VerifyingKey;
@@ -322,6 +322,12 @@ impl Replica {
     #[must_use]
     pub fn verify_beacon(&self, beacon: &Beacon) -> bool {
         self.members.get(&beacon.robot()).is_some_and(|member| beacon.verify(&member.key, self.swarm))
+    }
+
+    /// Whether a proof of life comes from the member it names.
+    #[must_use]
+    pub fn verify_life(&self, life: &Life) -> bool {
+        self.members.get(&life.content().robot).is_some_and(|member| life.verify(&member.key, self.swarm))
     }
 
     /// The cheap checks: size, form, swarm, roster.

@@ -5,6 +5,7 @@
 
 use super::entry::SwarmTag;
 use super::frame::{WireError, to_bytes};
+use super::life::BeaconAge;
 use super::pose::{EstimateError, RawBeaconPose};
 use crate::geometry::PoseWithCovariance;
 use crate::ids::{FrameId, RobotId, SubmapId};
@@ -27,6 +28,13 @@ pub struct BeaconContent {
     pub counter: u64,
     /// Pose of the body in the anchor, with the covariance of its local perturbation.
     pub t_anchor_body: PoseWithCovariance,
+}
+
+impl BeaconContent {
+    /// Which of the robot's beacons it is.
+    pub fn age(&self) -> BeaconAge {
+        BeaconAge { epoch: self.anchor.frame.epoch, stamp: self.stamp, counter: self.counter }
+    }
 }
 
 /// A signed [`BeaconContent`], which it derefs to. Decoding does not look at the signature: [`Beacon::verify`] does.
@@ -53,7 +61,7 @@ struct RawBody {
 }
 
 impl Beacon {
-    /// OverlapFeatures a beacon. Its content is what a receiver will read: rounded, with a covariance that is never
+    /// Signs a beacon. Its content is what a receiver will read: rounded, with a covariance that is never
     /// smaller.
     ///
     /// # Errors

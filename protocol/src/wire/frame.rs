@@ -37,11 +37,15 @@ pub enum FrameKind {
     AlignReply = 9,
     /// A piece of a blob that proves itself.
     BlobSlice = 10,
+    /// "Are you there now?"
+    LifeRequest = 11,
+    /// A signed yes.
+    LifeReply = 12,
 }
 
 impl FrameKind {
     /// Every kind, in order of its number.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::Pose,
         Self::Facts,
         Self::Have,
@@ -52,6 +56,8 @@ impl FrameKind {
         Self::AlignRequest,
         Self::AlignReply,
         Self::BlobSlice,
+        Self::LifeRequest,
+        Self::LifeReply,
     ];
 
     fn of(number: u8) -> Option<Self> {
@@ -61,9 +67,9 @@ impl FrameKind {
     /// Longest frame of this kind, in bytes.
     pub fn len_max(self) -> usize {
         match self {
-            Self::Pose => BEACON_LEN_MAX,
+            Self::Pose | Self::LifeReply => BEACON_LEN_MAX,
             Self::Have => HAVE_LEN_MAX,
-            Self::BlobRequest | Self::AlignRequest | Self::AlignReply => SMALL_LEN_MAX,
+            Self::BlobRequest | Self::AlignRequest | Self::AlignReply | Self::LifeRequest => SMALL_LEN_MAX,
             Self::Facts | Self::SyncRequest | Self::SyncReply | Self::BlobReply | Self::BlobSlice => {
                 MESSAGE_LEN_MAX + MESSAGE_OVERHEAD_MAX
             }

@@ -4,6 +4,7 @@ use super::beacon::Beacon;
 use super::entry::Entry;
 use super::fact::{Fact, VerdictOutcome};
 use super::have::{HaveVector, Head, Members};
+use super::life::{Life, Nonce};
 use crate::geometry::{PoseWithCovariance, Relative, Sim3};
 use crate::ids::{Hash, RobotId};
 use core::fmt::Display;
@@ -39,6 +40,20 @@ pub(super) fn beacon<S: Serializer>(beacon: &Beacon, s: S) -> Result<S::Ok, S::E
         "t_anchor_body": pose(&beacon.t_anchor_body),
     })
     .serialize(s)
+}
+
+/// A drawn number.
+pub(super) fn nonce<S: Serializer>(nonce: &Nonce, s: S) -> Result<S::Ok, S::Error> {
+    s.collect_str(&format_args!("{:032x}", u128::from_be_bytes(*nonce)))
+}
+
+pub(super) fn life<S: Serializer>(life: &Life, s: S) -> Result<S::Ok, S::Error> {
+    let content = life.content();
+    let latest = content.latest.map(
+        |latest| json!({ "epoch": latest.epoch, "stamp_secs": latest.stamp.as_secs_f64(), "counter": latest.counter }),
+    );
+    let nonce = format!("{:032x}", u128::from_be_bytes(content.nonce));
+    json!({ "robot": content.robot.to_string(), "nonce": nonce, "latest": latest }).serialize(s)
 }
 
 pub(super) fn have<S: Serializer>(have: &HaveVector, s: S) -> Result<S::Ok, S::Error> {

@@ -6,6 +6,7 @@ use super::beacon::{Beacon, RawBeacon};
 use super::entry::EntryBytes;
 use super::frame::{self, FrameKind, WireError};
 use super::have::{HaveRoot, HaveVector, RawHaveVector};
+use super::life::{Life, Nonce};
 use super::limits::{
     self, BLOB_LEN_MAX, ENTRIES_PER_DELTA_MAX, ENTRY_LEN_MAX, FORKS_PER_DELTA_MAX, MESSAGE_LEN_MAX, PROOF_MAX,
 };
@@ -68,6 +69,14 @@ pub enum Message {
         /// The answer.
         status: AlignStatus,
     },
+    /// "Are you there now?"
+    LifeRequest {
+        /// To be signed.
+        #[serde(serialize_with = "super::json::nonce")]
+        nonce: Nonce,
+    },
+    /// A signed yes.
+    LifeReply(#[serde(serialize_with = "super::json::life")] Life),
 }
 
 /// Entries that a have-vector lacks.
@@ -148,6 +157,8 @@ impl Message {
             }
             Self::AlignRequest { i, j } => frame::seal(kind, &(i, j)),
             Self::AlignReply { status } => frame::seal(kind, status),
+            Self::LifeRequest { nonce } => frame::seal(kind, nonce),
+            Self::LifeReply(life) => frame::seal(kind, life),
         }
     }
 
@@ -198,6 +209,8 @@ impl Message {
                 Self::AlignRequest { i, j }
             }
             FrameKind::AlignReply => Self::AlignReply { status: frame::parse_body(kind, body)? },
+            FrameKind::LifeRequest => Self::LifeRequest { nonce: frame::parse_body(kind, body)? },
+            FrameKind::LifeReply => Self::LifeReply(frame::parse_body(kind, body)?),
         })
     }
 
@@ -221,7 +234,7 @@ impl Message {
         messages
     }
 
-    /// A short name for byte counters: pose, facts, have, sync, blob or align.
+    /// A short name for byte counters: pose, facts, have, sync, blob, align or life.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Pose(_) => "pose",
@@ -230,6 +243,7 @@ impl Message {
             Self::SyncRequest(_) | Self::SyncReply(_) => "sync",
             Self::BlobRequest { .. } | Self::BlobReply { .. } => "blob",
             Self::AlignRequest { .. } | Self::AlignReply { .. } => "align",
+            Self::LifeRequest { .. } | Self::LifeReply(_) => "life",
         }
     }
 
@@ -245,6 +259,8 @@ impl Message {
             Self::BlobReply { .. } => FrameKind::BlobSlice,
             Self::AlignRequest { .. } => FrameKind::AlignRequest,
             Self::AlignReply { .. } => FrameKind::AlignReply,
+            Self::LifeRequest { .. } => FrameKind::LifeRequest,
+            Self::LifeReply(_) => FrameKind::LifeReply,
         }
     }
 }

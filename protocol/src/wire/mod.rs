@@ -12,6 +12,7 @@ mod golden;
 pub mod have;
 mod json;
 mod lattice;
+pub mod life;
 pub mod limits;
 #[cfg(test)]
 mod limits_tests;
@@ -29,5 +30,6 @@ pub use entry::{Entry, EntryBytes, EntryContent, EntryError, SwarmTag};
 pub use fact::Fact;
 pub use frame::WireError;
 pub use have::{HaveRoot, HaveVector, Head, Members};
+pub use life::{BeaconAge, Life, LifeContent, Nonce};
 pub use messages::{AlignStatus, Delta, Message};
 pub use payload::FactError;

@@ -193,6 +193,15 @@ samples! {
         Message::AlignReply { status: AlignStatus::NotMine } => {
             "align_reply_not_mine" => Message::AlignReply { status: AlignStatus::NotMine }
         }
+        Message::LifeRequest { .. } => { "life_request" => Message::LifeRequest { nonce: *b"drawn this time!" } }
+        Message::LifeReply(_) => {
+            "life_reply" => Message::LifeReply(life()),
+            "life_reply_silent" => Message::LifeReply(Life::sign(
+                &key(1),
+                SwarmTag::of(&swarm()),
+                LifeContent { robot: robot(1), nonce: *b"drawn this time!", latest: None },
+            )),
+        }
     }
 }
 
@@ -217,6 +226,12 @@ pub fn beacon() -> Beacon {
         t_anchor_body: estimate(),
     };
     Beacon::sign(&key(0), SwarmTag::of(&swarm()), &content).unwrap()
+}
+
+pub fn life() -> Life {
+    let latest = BeaconAge { epoch: 203_000_000, stamp: Stamp(1_700_000_000_123_456_789), counter: 1234 };
+    let content = LifeContent { robot: robot(0), nonce: *b"drawn this time!", latest: Some(latest) };
+    Life::sign(&key(0), SwarmTag::of(&swarm()), content)
 }
 
 /// A vector by the roster; `tag` gives the n-th log's.

@@ -241,7 +241,7 @@ fn garbage_is_refused_and_every_question_answered_exactly_once() {
     let garbage: [&[u8]; 5] = [b"", b"x", &[0xff; 70_000], b"Mg\x63\x01abc", &[0; 64]];
     let mut token = 0;
     for bytes in garbage {
-        for kind in [QueryKind::Sync, QueryKind::Blob, QueryKind::Align] {
+        for kind in [QueryKind::Sync, QueryKind::Blob, QueryKind::Align, QueryKind::Life] {
             token += 1;
             agent.handle(Instant::ZERO, Input::Asked { token: AskToken(token), kind, bytes: bytes.to_vec() });
             let answers = drain(&mut agent)
@@ -255,7 +255,7 @@ fn garbage_is_refused_and_every_question_answered_exactly_once() {
             let _ = drain(&mut agent);
         }
     }
-    assert_eq!(agent.snapshot(Instant::ZERO).stats.rejected.values().sum::<u64>(), 30);
+    assert_eq!(agent.snapshot(Instant::ZERO).stats.rejected.values().sum::<u64>(), 35);
 }
 
 #[test]

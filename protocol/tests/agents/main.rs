@@ -17,6 +17,7 @@ mod front_ends;
 mod link_budget;
 mod lookalikes;
 mod outsiders;
+mod recorded;
 mod restarts;
 mod second_looks;
 mod sightings;

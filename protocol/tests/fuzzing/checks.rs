@@ -149,6 +149,7 @@ impl Shell {
                     (QueryKind::Sync, Message::SyncRequest(_))
                         | (QueryKind::Blob, Message::BlobRequest { .. })
                         | (QueryKind::Align, Message::AlignRequest { .. })
+                        | (QueryKind::Life, Message::LifeRequest { .. })
                 );
                 assert!(good && peer != agent.robot() && (0..MEMBERS).any(|k| robot(k) == peer));
                 assert!(self.asked.iter().all(|asked| asked.query != query), "questions have numbers of their own");

@@ -9,14 +9,14 @@ use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3
 use merganser_protocol::ids::{EntryId, FrameId, Hash, Name, RobotId, SubmapId};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::{
-    AlignmentFact, CarriedFact, CondensedFact, Fact, LookalikeFact, PositionFact, RefusalReason, ScaleKind,
-    SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
+    AlignmentFact, CarriedFact, CondensedFact, Fact, LookalikeFact, PositionFact, RefusalReason, RetiredFact,
+    ScaleKind, SightingFact, SubmapFact, VerdictFact, VerdictOutcome,
 };
 use merganser_protocol::wire::limits::{BLOB_PIECE_LEN, PAYLOAD_LEN_MAX};
 use merganser_protocol::wire::slice;
 use merganser_protocol::wire::{
-    AlignStatus, Beacon, BeaconContent, Delta, Entry, EntryBytes, EntryContent, HaveRoot, HaveVector, Head, Members,
-    Message, SwarmTag,
+    AlignStatus, Beacon, BeaconAge, BeaconContent, Delta, Entry, EntryBytes, EntryContent, HaveRoot, HaveVector, Head,
+    Life, LifeContent, Members, Message, SwarmTag,
 };
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
@@ -136,10 +136,15 @@ impl Forge {
             }
             7 if r.one_in(2) => {
                 let i = u32::from(r.byte() % 8);
+                if r.one_in(4) {
+                    let below = NonZero::new(1 + i).unwrap();
+                    let fact = Fact::Retired(RetiredFact { below });
+                    return (fact.kind(), fact.to_payload().unwrap());
+                }
                 Fact::Lookalike(LookalikeFact { i, j: i + u32::from(r.byte() % 8) })
             }
             _ => {
-                let (kind, len) = (r.byte() % 9, r.below(64));
+                let (kind, len) = (r.byte() % 10, r.below(64));
                 return (kind, r.bytes(len).to_vec());
             }
         };
@@ -170,8 +175,9 @@ impl Forge {
 
     /// A question of the kind asked for, or of another.
     pub fn question(&self, r: &mut Reader) -> (QueryKind, Message) {
-        let way = r.below(4);
+        let way = r.below(5);
         match way {
+            4 => (QueryKind::Life, Message::LifeRequest { nonce: [r.byte(); 16] }),
             0 | 1 => (QueryKind::Sync, Message::SyncRequest(self.vector(r))),
             2 => {
                 let hash = if r.one_in(4) { Hash::of(b"nobody has it") } else { Hash::of(&described().0) };
@@ -222,6 +228,14 @@ impl Forge {
                 };
                 let proof = if r.one_in(4) { vec![[7; 32]; r.below(4)] } else { slice::proof(blob, start..end) };
                 Message::BlobReply { hash, offset, total, bytes, proof }
+            }
+            (QueryKind::Life, Ok(Message::LifeRequest { nonce })) => {
+                let who = r.pick(&WRITERS);
+                let latest =
+                    BeaconAge { epoch: u32::from(r.byte() % 4), stamp: Stamp(r.u64() as i64), counter: r.u64() };
+                let nonce = if r.one_in(4) { [7; 16] } else { nonce };
+                let content = LifeContent { robot: robot(who), nonce, latest: r.one_in(2).then_some(latest) };
+                Message::LifeReply(Life::sign(key(if r.one_in(4) { 0 } else { who }), SwarmTag::of(&swarm()), content))
             }
             _ => Message::AlignReply { status: r.pick(&[AlignStatus::Accepted, AlignStatus::Busy, AlignStatus::Done]) },
         };

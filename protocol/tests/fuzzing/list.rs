@@ -12,7 +12,7 @@ use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOu
 use merganser_protocol::wire::{Beacon, BeaconContent, Entry, EntryBytes, EntryContent, HaveRoot, Message, SwarmTag};
 
 const CHANNELS: [Channel; 3] = [Channel::Pose, Channel::Facts, Channel::Have];
-const KINDS: [QueryKind; 3] = [QueryKind::Sync, QueryKind::Blob, QueryKind::Align];
+const KINDS: [QueryKind; 4] = [QueryKind::Sync, QueryKind::Blob, QueryKind::Align, QueryKind::Life];
 
 /// Every frozen message and entry of version 1.
 fn golden() -> Vec<Vec<u8>> {

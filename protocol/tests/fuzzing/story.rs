@@ -415,5 +415,5 @@ fn any_channel(r: &mut Reader, usual: Channel) -> Channel {
 }
 
 fn any_kind(r: &mut Reader, usual: QueryKind) -> QueryKind {
-    r.pick(&[usual, usual, usual, usual, usual, QueryKind::Sync, QueryKind::Blob, QueryKind::Align])
+    r.pick(&[usual, usual, usual, usual, usual, QueryKind::Sync, QueryKind::Blob, QueryKind::Align, QueryKind::Life])
 }

@@ -346,6 +346,7 @@ fn ask_name(kind: QueryKind) -> &'static str {
         QueryKind::Sync => "sync",
         QueryKind::Blob => "blob",
         QueryKind::Align => "align",
+        QueryKind::Life => "life",
     }
 }
 
@@ -354,6 +355,7 @@ fn answer_name(kind: QueryKind) -> &'static str {
         QueryKind::Sync => "sync answer",
         QueryKind::Blob => "blob answer",
         QueryKind::Align => "align answer",
+        QueryKind::Life => "life answer",
     }
 }
 

@@ -28,6 +28,8 @@ pub(in crate::agent) struct Live {
     robot: RobotId,
     anchor: SubmapId,
     t_anchor_body: PoseWithCovariance,
+    /// Whether it is known to be there now.
+    is_live: bool,
     age_secs: f64,
     stamp_secs: f64,
 }
@@ -41,14 +43,16 @@ pub(in crate::agent) fn live_robots(
 ) -> Vec<Live> {
     let own = body.map(|(index, t_anchor_body, stamp)| {
         let anchor = SubmapId { frame: context.frame(), index };
-        Live { robot: context.robot(), anchor, t_anchor_body, age_secs: 0.0, stamp_secs: stamp.as_secs_f64() }
+        let stamp_secs = stamp.as_secs_f64();
+        Live { robot: context.robot(), anchor, t_anchor_body, is_live: true, age_secs: 0.0, stamp_secs }
     });
-    let others = beacons.iter().map(|(robot, seen)| Live {
+    let others = beacons.last_known(now).map(|(robot, known)| Live {
         robot,
-        anchor: seen.content.anchor,
-        t_anchor_body: seen.content.t_anchor_body,
-        age_secs: now.since(seen.at).as_secs_f64(),
-        stamp_secs: seen.content.stamp.as_secs_f64(),
+        anchor: known.content.anchor,
+        t_anchor_body: known.content.t_anchor_body,
+        is_live: known.is_live,
+        age_secs: known.age_secs,
+        stamp_secs: known.content.stamp.as_secs_f64(),
     });
     own.into_iter().chain(others).collect()
 }
@@ -79,6 +83,7 @@ pub(in crate::agent) fn robot_view(
     let t_own_body = estimation.t_own_body(context.frame(), live.anchor, &live.t_anchor_body);
     RobotView {
         robot: context.robot_name(live.robot),
+        live: live.is_live,
         age_secs: live.age_secs,
         stamp_secs: live.stamp_secs,
         anchor: context.submap_name(live.anchor),
@@ -89,6 +94,7 @@ pub(in crate::agent) fn robot_view(
 
 /// The relations of live robots that the estimate knows.
 pub(in crate::agent) fn pair_views(context: &Context, estimation: &Estimation, live: &[Live]) -> Vec<RobotPairView> {
+    let live: Vec<&Live> = live.iter().filter(|robot| robot.is_live).collect();
     let pairs = live.iter().enumerate().flat_map(|(k, a)| live[k + 1..].iter().map(move |b| (a, b)));
     let related = pairs.filter_map(|(a, b)| {
         let t_anchor_anchor = estimation.t_anchor_anchor(a.anchor, b.anchor)?;

@@ -140,7 +140,9 @@ impl Mapping {
                 "is too far in time from the last keyframe; hand over keyframes more often, with the same clock",
             );
         }
-        let beacon = beacons.of(seen).ok_or("names a robot of which no pose beacon was heard yet")?;
+        let beacon = beacons.of(seen).ok_or(
+            "names a robot that is not known to be there: no pose beacon was heard, or it has not answered yet",
+        )?;
         let age = context.now().since(beacon.since).as_secs_f64();
         if age > SIGHTING_AGE_SECS_MAX {
             return Err("names a robot whose last keyframe is too old, by its beacons; lower its gossip.pose_secs");

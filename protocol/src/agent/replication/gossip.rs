@@ -15,7 +15,7 @@ use crate::time::{Instant, Stamp};
 use crate::wire::limits::BLOB_PIECE_LEN;
 use crate::wire::messages::Message;
 use crate::wire::slice;
-use crate::wire::{Beacon, BeaconContent, Delta, EntryBytes};
+use crate::wire::{Beacon, BeaconContent, Delta, EntryBytes, Nonce};
 use core::time::Duration;
 use std::collections::BTreeMap;
 
@@ -59,11 +59,13 @@ pub(in crate::agent) struct Question {
 }
 
 #[derive(Clone, Copy, Debug)]
-enum About {
+pub(super) enum About {
     Sync,
     /// The piece of this blob that begins there.
     Blob(Hash, usize),
     Align,
+    /// With the number to be signed.
+    Life(Nonce),
 }
 
 /// What came of a question of ours, as far as it concerns others.
@@ -192,7 +194,10 @@ impl Replication {
         let counter = self.gossip.beacon_counter;
         let content = BeaconContent { anchor, stamp, counter, t_anchor_body };
         match Beacon::sign(&context.me().key, self.replica.swarm(), &content) {
-            Ok(beacon) => self.publish(context, Channel::Pose, &Message::Pose(beacon)),
+            Ok(beacon) => {
+                self.lives.latest = Some(beacon.age());
+                self.publish(context, Channel::Pose, &Message::Pose(beacon));
+            }
             Err(error) => context.reject(Some(context.robot()), "own pose", &error.to_string()),
         }
     }
@@ -201,7 +206,7 @@ impl Replication {
         self.gossip.neighbours().next().is_none()
     }
 
-    fn ask(
+    pub(super) fn ask(
         &mut self,
         context: &mut Context,
         peer: RobotId,
@@ -267,8 +272,8 @@ impl Replication {
         if !self.replica.verify_beacon(beacon) {
             return context.reject_unsigned(from, "pose: signature", "the beacon's own signature does not hold");
         }
-        if beacon.robot() != context.robot() {
-            self.beacons.hear(**beacon, context.now());
+        if beacon.robot() != context.robot() && self.beacons.hear(**beacon, context.now()) {
+            self.ask_life(context, beacon.robot());
         }
     }
 
@@ -347,6 +352,12 @@ impl Replication {
                 self.on_piece(context, query, (hash, at, total), bytes, &proof)
             }
             (About::Align, Message::AlignReply { .. }) => Reply::Nothing,
+            (About::Life(nonce), Message::LifeReply(life)) => {
+                if self.on_life(context, (question.peer, nonce), &life) {
+                    self.gossip.questions.remove(&query);
+                }
+                Reply::Nothing
+            }
             (_, other) => {
                 context.reject_unsigned(question.peer, "wrong answer", other.kind());
                 Reply::Nothing
@@ -387,7 +398,7 @@ impl Replication {
             }
             (About::Blob(hash, _), Answer::Postponed) => Reply::PutOff(hash),
             (About::Blob(..), _) => Reply::NoPiece,
-            (About::Align, _) => Reply::Nothing,
+            (About::Align | About::Life(_), _) => Reply::Nothing,
         }
     }
 
@@ -440,6 +451,7 @@ impl Replication {
             (QueryKind::Sync, Message::SyncRequest(_))
                 | (QueryKind::Blob, Message::BlobRequest { .. })
                 | (QueryKind::Align, Message::AlignRequest { .. })
+                | (QueryKind::Life, Message::LifeRequest { .. })
         );
         if !is_of_kind {
             context.reject(None, "wrong question", question.kind());
@@ -456,6 +468,7 @@ impl Replication {
                 Some(Message::SyncReply(self.repair(context, &have)))
             }
             Message::BlobRequest { hash, offset, len } => self.piece(context, hash, offset as usize, len as usize),
+            Message::LifeRequest { nonce } => self.prove_life(context, nonce),
             _ => None,
         }
     }
@@ -476,7 +489,7 @@ impl Replication {
         let class = match kind {
             QueryKind::Sync => Class::Repair,
             QueryKind::Blob => Class::Blob,
-            QueryKind::Align => Class::Have,
+            QueryKind::Align | QueryKind::Life => Class::Have,
         };
         let bytes = answer.map_or_else(Vec::new, |message| self.pay_for_answer(context, class, message));
         context.put(Output::Answer { token, bytes });

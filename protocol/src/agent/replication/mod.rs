@@ -13,6 +13,7 @@ pub(super) mod copies;
 mod gossip;
 pub(super) mod knowledge;
 mod ledger;
+mod lives;
 mod retiring;
 mod traffic;
 
@@ -32,6 +33,7 @@ use condensing::Condensing;
 use gossip::Gossip;
 use knowledge::{Knowledge, Known};
 use ledger::Ledger;
+use lives::Lives;
 use std::collections::BTreeSet;
 
 /// See the module.
@@ -42,6 +44,7 @@ pub(super) struct Replication {
     ledger: Ledger,
     gossip: Gossip,
     beacons: Beacons,
+    lives: Lives,
     blobs: Blobs,
     condensing: Condensing,
 }
@@ -53,7 +56,8 @@ impl Replication {
             knowledge: Knowledge::default(),
             ledger: Ledger::default(),
             gossip: Gossip::new(context.robot(), &context.config().gossip, context.now()),
-            beacons: Beacons::default(),
+            beacons: Beacons::new(context.now()),
+            lives: Lives::default(),
             blobs: Blobs::default(),
             condensing: Condensing::default(),
         }
