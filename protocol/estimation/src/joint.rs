@@ -32,9 +32,9 @@ use thiserror::Error;
 /// Rounds in which the map lets in what agrees with it: each makes it surer of the next.
 const ADMISSIONS_MAX: usize = 4;
 
-/// Bytes that a component of the map may take while it is solved: what robots have, and half of what a graph of one's
-/// own may take. Whoever sends a map that takes more has his frame left out.
-pub const MAP_BYTES_MAX: u64 = 2 << 30;
+/// Bytes that a component of the map may take while it is solved: half of the gibibyte that the agent's unit file grants
+/// it. Whoever sends a map that takes more has his frame left out.
+pub const MAP_BYTES_MAX: u64 = 512 << 20;
 
 /// A frame's own trajectory of anchors.
 #[derive(Clone, Debug, PartialEq)]

@@ -46,7 +46,7 @@ pub use alignment::{
 pub use estimation::{ROBOTS_ALL_PAIRS_MAX, estimate_version};
 pub use mapping::{CLOCK_BACK_KEYFRAMES, PATH_KEYFRAMES_MAX, SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
 pub use replication::knowledge::Agreement;
-pub use replication::{BLOBS_MAX, GONE_IN_A_ROW_MAX, UNSENT_MAX};
+pub use replication::{BLOBS_MAX, GONE_IN_A_ROW_MAX, PROOFS_PER_SEC, UNSENT_MAX};
 
 /// Who this agent is and whom it trusts.
 #[derive(Clone)]

@@ -30,8 +30,8 @@ impl Replica {
     }
 
     /// The first epoch that can stay if a log of this frame is begun; `None` if all can. Older ones go that the others
-    /// would have no room for, and those beyond half of the bytes that are granted to a member, so that there is room
-    /// to write.
+    /// would have no room for, and those beyond three quarters of the bytes that are granted to a member, so that there
+    /// is room to write.
     pub fn to_retire(&self, frame: FrameId) -> Option<u32> {
         if self.slots.contains_key(&frame) {
             return None;
@@ -39,7 +39,7 @@ impl Replica {
         let (mut count, mut bytes, mut first) = (0, 0, frame.epoch);
         for (older, slot) in self.slots_of(frame.robot).rev().filter(|(older, _)| **older < frame) {
             (count, bytes) = (count + 1, bytes + bytes_of(slot));
-            if count >= self.epochs_per_robot_max || bytes > self.member_bytes_max / 2 {
+            if count >= self.epochs_per_robot_max || bytes > self.member_bytes_max / 4 * 3 {
                 return Some(first);
             }
             first = older.epoch;

@@ -179,7 +179,7 @@ fn a_log_that_is_replaced_counts_for_what_replaces_it() {
 }
 
 #[test]
-fn a_writer_whose_share_is_full_goes_on_in_a_new_epoch_with_half_of_it() {
+fn a_writer_whose_share_is_full_goes_on_in_a_new_epoch_with_room_to_write() {
     let (mut writer, mut reader) = (small(), small());
     let mut epoch = 1;
     for k in 0..2000 {
@@ -195,7 +195,10 @@ fn a_writer_whose_share_is_full_goes_on_in_a_new_epoch_with_half_of_it() {
         settle(&mut writer);
         feed(&mut reader, &entries);
         let bytes = writer.bytes_of(frame(1, 0).robot);
-        assert!(bytes <= MEMBER_BYTES_MIN && (entries.len() == 1 || bytes <= MEMBER_BYTES_MIN / 2 + 1000), "{bytes}");
+        assert!(
+            bytes <= MEMBER_BYTES_MIN && (entries.len() == 1 || bytes <= MEMBER_BYTES_MIN / 4 * 3 + 1000),
+            "{bytes}"
+        );
     }
     assert!(epoch > 5, "{epoch}");
     assert_eq!(view(&reader), view(&writer));

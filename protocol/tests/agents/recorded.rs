@@ -2,10 +2,10 @@
 //! be, not that it is there, and nothing is measured against it.
 
 use super::common::{Wires, World, agent, drive, identity, name, robot, secret};
-use merganser_protocol::agent::Restored;
-use merganser_protocol::agent::io::{Channel, Input, QueryKind, Sighting};
+use merganser_protocol::agent::io::{AskToken, Channel, Input, Output, QueryKind, Sighting};
+use merganser_protocol::agent::{PROOFS_PER_SEC, Restored};
 use merganser_protocol::snapshot::RobotView;
-use merganser_protocol::time::Stamp;
+use merganser_protocol::time::{Instant, Stamp};
 use merganser_protocol::wire::{BeaconAge, Life, LifeContent, Message, SwarmTag};
 use std::time::Duration;
 
@@ -120,4 +120,24 @@ fn nobody_else_can_say_that_it_is_there() {
     let newer = wires.published.iter().rfind(|(k, channel, _)| (*k, *channel) == (1, Channel::Pose)).unwrap();
     play(&mut lied, &newer.2);
     assert!(of_beta(&lied).unwrap().live);
+}
+
+/// Whoever asks is not known, and costs a signature.
+#[test]
+fn so_many_proofs_of_life_are_signed_in_a_second_and_no_more() {
+    let mut alpha = agent(0, Restored::default());
+    let mut ask = |number: u8, millis: u64| {
+        let (token, bytes) = (AskToken(u64::from(number)), Message::LifeRequest { nonce: [number; 16] }.encode());
+        alpha.handle(Instant::from_nanos(millis * 1_000_000), Input::Asked { token, kind: QueryKind::Life, bytes });
+        let answers = core::iter::from_fn(|| alpha.poll_output()).filter_map(|output| match output {
+            Output::Answer { bytes, .. } => Some(!bytes.is_empty()),
+            _ => None,
+        });
+        answers.collect::<Vec<_>>()
+    };
+    for number in 0..PROOFS_PER_SEC as u8 {
+        assert_eq!(ask(number, u64::from(number)), [true]);
+    }
+    assert_eq!(ask(101, 999), [false]);
+    assert_eq!(ask(102, 1_000), [true]);
 }

@@ -278,7 +278,7 @@ impl Default for GossipConfig {
             condense_entries: 1_000,
             entries_per_frame_max: 100_000,
             epochs_per_robot_max: 64,
-            facts_bytes_max: 128 << 20,
+            facts_bytes_max: 256 << 20,
         }
     }
 }

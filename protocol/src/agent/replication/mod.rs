@@ -21,6 +21,7 @@ pub use blobs::BLOBS_MAX;
 pub use condensing::GONE_IN_A_ROW_MAX;
 pub(super) use gossip::{Body, Lacking, Reply};
 pub(super) use ledger::{BATCHES_WAITING_MAX, Heard, Written};
+pub use lives::PROOFS_PER_SEC;
 pub use traffic::UNSENT_MAX;
 
 use super::context::Context;
