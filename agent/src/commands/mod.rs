@@ -1,5 +1,6 @@
 //! What the program does, a file per subcommand.
 
+pub mod align;
 pub mod check;
 pub mod graph;
 pub mod keys;

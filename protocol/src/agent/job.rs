@@ -196,6 +196,21 @@ impl From<RefusalReason> for NotAligned {
     }
 }
 
+/// [`NotAligned`], and in words what was found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Refused {
+    /// For robots.
+    pub not: NotAligned,
+    /// For people.
+    pub why: String,
+}
+
+impl Refused {
+    fn new(not: impl Into<NotAligned>, why: impl ToString) -> Self {
+        Self { not: not.into(), why: why.to_string() }
+    }
+}
+
 impl Job {
     /// Does the work. Deterministic: the same job gives the same result.
     pub fn run(self) -> JobResult {
@@ -204,7 +219,7 @@ impl Job {
                 let described = submap::describe(&job.submap, &job.config);
                 JobResult::Described(Box::new((job.submap, described)))
             }
-            Self::Align(job) => JobResult::Aligned(job.run().map(Box::new)),
+            Self::Align(job) => JobResult::Aligned(job.look().map(Box::new).map_err(|refused| refused.not)),
             Self::Solve(job) => JobResult::Solved(Box::new(job.run())),
         }
     }
@@ -258,13 +273,18 @@ impl SolveJob {
 }
 
 impl AlignJob {
-    fn run(&self) -> Result<Measured, NotAligned> {
+    /// Does the work.
+    ///
+    /// # Errors
+    /// Why there is no alignment.
+    pub fn look(&self) -> Result<Measured, Refused> {
         let there = self.one_way(&self.theirs, &self.mine, self.verticals)?;
         let Some((keypoints, features)) = &self.back else { return Ok(there) };
         let back = self.one_way(keypoints, features, self.verticals.map(Verticals::back))?;
         let t_mine_theirs = back.t_mine_theirs.inverse();
         if !two_sided::agree(&there.t_mine_theirs, &t_mine_theirs) {
-            return Err(RefusalReason::Ambiguous.into());
+            let why = "seen from the one they lie otherwise than seen from the other, by more than both claim";
+            return Err(Refused::new(RefusalReason::Ambiguous, why));
         }
         let t_mine_theirs = two_sided::midway(&there.t_mine_theirs, &t_mine_theirs);
         Ok(Measured {
@@ -277,43 +297,33 @@ impl AlignJob {
 
     /// Where units are metres, clouds judge the poses that matches suggest; else the matches alone decide. In the plane
     /// all poses are tried.
-    fn one_way(
-        &self,
-        theirs: &Keypoints,
-        mine: &Features,
-        verticals: Option<Verticals>,
-    ) -> Result<Measured, NotAligned> {
+    fn one_way(&self, theirs: &Keypoints, mine: &Features, verticals: Option<Verticals>) -> Result<Measured, Refused> {
         match (self.sensor, self.scale) {
             (Sensor::Laser2d, ScaleKind::Metric) => {
                 self.measured(submap::planar::register(theirs, mine, &PlanarConfig::default()))
             }
             // In the plane nobody tells a scale.
-            (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => Err(RefusalReason::BadInput.into()),
-            (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(theirs, mine, true),
-            (Sensor::Landmarks, _) => Ok(upright(self.landmarks(theirs, mine, false)?, verticals)?),
-            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Metric) => self.register(theirs, mine, verticals),
-            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Unknown) => {
-                Ok(upright(self.align(theirs, mine)?, verticals)?)
+            (Sensor::Laser2d | Sensor::Landmarks2d, ScaleKind::Unknown) => {
+                Err(Refused::new(RefusalReason::BadInput, "what lies in a plane tells no scale; state it in metres"))
             }
+            (Sensor::Landmarks2d, ScaleKind::Metric) => self.landmarks(theirs, mine, true),
+            (Sensor::Landmarks, _) => upright(self.landmarks(theirs, mine, false)?, verticals),
+            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Metric) => self.register(theirs, mine, verticals),
+            (Sensor::Points3d | Sensor::Lidar3d, ScaleKind::Unknown) => upright(self.align(theirs, mine)?, verticals),
         }
     }
 
-    fn landmarks(&self, theirs: &Keypoints, mine: &Features, planar: bool) -> Result<Measured, NotAligned> {
+    fn landmarks(&self, theirs: &Keypoints, mine: &Features, planar: bool) -> Result<Measured, Refused> {
         let config = LandmarkConfig { planar, solver: self.solver() };
-        let found = landmarks::register(theirs, mine, &config).map_err(|e| NotAligned {
-            reason: RefusalReason::from(&e),
-            elsewhere: matches!(e, LandmarkError::Ambiguous { elsewhere: true, .. }),
+        let found = landmarks::register(theirs, mine, &config).map_err(|e| {
+            let elsewhere = matches!(e, LandmarkError::Ambiguous { elsewhere: true, .. });
+            Refused::new(NotAligned { reason: RefusalReason::from(&e), elsewhere }, e)
         })?;
         let landmarks::Aligned { t_mine_theirs, sigma, support, log10_nfa } = found;
         Ok(Measured { t_mine_theirs, sigma, support, log10_nfa })
     }
 
-    fn register(
-        &self,
-        theirs: &Keypoints,
-        mine: &Features,
-        verticals: Option<Verticals>,
-    ) -> Result<Measured, NotAligned> {
+    fn register(&self, theirs: &Keypoints, mine: &Features, verticals: Option<Verticals>) -> Result<Measured, Refused> {
         let config = RegisterConfig {
             solver: self.solver(),
             fit_min: self.config.fit_min,
@@ -324,23 +334,24 @@ impl AlignJob {
         self.measured(submap::register(theirs, mine, &config))
     }
 
-    fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, NotAligned> {
-        let found = found.map_err(|error| match error {
-            RegisterError::Ambiguous { elsewhere, .. } | RegisterError::Aliased { elsewhere, .. } => {
-                NotAligned { reason: RefusalReason::Ambiguous, elsewhere }
-            }
-            RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. } => RefusalReason::NoConsensus.into(),
-            RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate.into(),
-            RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit.into(),
-            RegisterError::Refine(_) => RefusalReason::NoConsensus.into(),
-            RegisterError::Solver(_)
-            | RegisterError::Thinning { .. }
-            | RegisterError::Crowded { .. }
-            | RegisterError::NotPlanar => RefusalReason::BadInput.into(),
+    fn measured(&self, found: Result<Registered, RegisterError>) -> Result<Measured, Refused> {
+        let found = found.map_err(|error| {
+            let not = match error {
+                RegisterError::Ambiguous { elsewhere, .. } | RegisterError::Aliased { elsewhere, .. } => {
+                    NotAligned { reason: RefusalReason::Ambiguous, elsewhere }
+                }
+                RegisterError::NoConsensus { .. } | RegisterError::Tilted { .. } => RefusalReason::NoConsensus.into(),
+                RegisterError::Refine(RefineError::Degenerate { .. }) => RefusalReason::Degenerate.into(),
+                RegisterError::Refine(RefineError::TooFewPairs { .. }) => RefusalReason::PoorFit.into(),
+                RegisterError::Refine(_) => RefusalReason::NoConsensus.into(),
+                RegisterError::Solver(_)
+                | RegisterError::Thinning { .. }
+                | RegisterError::Crowded { .. }
+                | RegisterError::NotPlanar => RefusalReason::BadInput.into(),
+            };
+            Refused::new(not, error)
         })?;
-        if found.log10_nfa > self.config.log10_nfa_max {
-            return Err(RefusalReason::NoConsensus.into());
-        }
+        self.is_no_chance(found.log10_nfa)?;
         Ok(Measured {
             t_mine_theirs: Relative::Metric(found.refined.pose),
             sigma: found.refined.rms,
@@ -349,8 +360,20 @@ impl AlignJob {
         })
     }
 
+    fn is_no_chance(&self, log10_nfa: f64) -> Result<(), Refused> {
+        let max = self.config.log10_nfa_max;
+        if log10_nfa <= max {
+            return Ok(());
+        }
+        let why = format!(
+            "by chance the best pose is as good once in 10^{:.1} tries, at least 10^{:.1} are asked for",
+            -log10_nfa, -max
+        );
+        Err(Refused::new(RefusalReason::NoConsensus, why))
+    }
+
     /// Matches, finds a consensus, checks the fit (MATH §4).
-    fn align(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, RefusalReason> {
+    fn align(&self, theirs: &Keypoints, mine: &Features) -> Result<Measured, Refused> {
         let matches = submap::match_keypoints(theirs, mine);
         let problem = Problem {
             source: &matches.source,
@@ -359,12 +382,14 @@ impl AlignJob {
             ..Problem::default()
         };
         let found = crate::align::align(&problem, &self.solver())
-            .map_err(|_| RefusalReason::BadInput)?
-            .map_err(RefusalReason::from)?;
+            .map_err(|error| Refused::new(RefusalReason::BadInput, error))?
+            .map_err(|refusal| Refused::new(RefusalReason::from(refusal), refusal))?;
         let radius = self.voxel_m * 1.5;
         let fit = submap::fit(theirs, mine, &found.t_target_source.sim(), radius);
         if fit < self.config.fit_min {
-            return Err(RefusalReason::PoorFit);
+            let why =
+                format!("{fit:.2} of the keypoints lie near the other's surface, {:.2} must", self.config.fit_min);
+            return Err(Refused::new(RefusalReason::PoorFit, why));
         }
         let t_mine_theirs = found.t_target_source;
         let (sigma, support, log10_nfa) = (found.sigma, found.support, found.log10_nfa);
@@ -387,14 +412,16 @@ impl AlignJob {
 }
 
 /// What matches alone decided, unless it tilts one submap's vertical against the other's.
-fn upright(measured: Measured, verticals: Option<Verticals>) -> Result<Measured, RefusalReason> {
+fn upright(measured: Measured, verticals: Option<Verticals>) -> Result<Measured, Refused> {
     let (rotation, covariance) = match &measured.t_mine_theirs {
         Relative::Metric(p) => (p.pose.rotation, p.covariance.matrix().fixed_view::<3, 3>(3, 3).into_owned()),
         Relative::Similarity(s) => (s.sim.rotation, s.covariance.matrix().fixed_view::<3, 3>(3, 3).into_owned()),
     };
     let sigma = covariance.symmetric_eigenvalues().max().sqrt();
     match verticals {
-        Some(known) if !known.allow(&rotation.matrix(), sigma) => Err(RefusalReason::NoConsensus),
+        Some(known) if !known.allow(&rotation.matrix(), sigma) => {
+            Err(Refused::new(RefusalReason::NoConsensus, "the pose tilts what both submaps know to be upright"))
+        }
         _ => Ok(measured),
     }
 }

@@ -1,0 +1,167 @@
+//! What `align` tells: text, JSON and a picture.
+
+use super::{Outcome, t_a_b};
+use crate::picture::{Robot, Scene};
+use anyhow::Result;
+use merganser_protocol::geometry::Relative;
+use merganser_protocol::kinds::RefusalReason;
+use merganser_protocol::snapshot::RelationView;
+use nalgebra::Vector3;
+use serde_json::{Value, json};
+use std::fmt::Write as _;
+
+/// Colours that colour-blind people tell apart (Okabe and Ito).
+const COLOURS: [&str; 2] = ["#0072b2", "#d55e00"];
+
+pub(super) fn text(outcome: &Outcome) -> String {
+    let mut text = String::new();
+    let submap = &outcome.config.submap;
+    for (letter, side) in ["A", "B"].iter().zip(&outcome.sides) {
+        let [read, left] = side.points;
+        let (name, keypoints) = (&side.name, side.keypoints.len());
+        let _ = writeln!(
+            text,
+            "{letter}  {name}: {read} points, nine in ten within {:.1} m; {left} left, {keypoints} keypoints",
+            side.range
+        );
+    }
+    let sigma = outcome.config.align.sigma_max_voxels * submap.voxel_m;
+    let sensor = name(&submap.sensor);
+    let _ = writeln!(text, "   as {sensor}, thinned to {} m, noise of {sigma:.3} m at most\n", submap.voxel_m);
+    match &outcome.found {
+        Ok(found) => {
+            let (covariance, pose) = (sigmas(&found.t_mine_theirs), found.t_mine_theirs.sim());
+            let turn = pose.rotation.log().map(f64::to_degrees);
+            let [x, y, z] = pose.translation.into();
+            let s = &covariance;
+            let _ = write!(
+                text,
+                "aligned: t_a_b, which maps B into A\n\
+                 \x20   translation ({x:8.3}, {y:8.3}, {z:8.3}) m   σ ({:.3}, {:.3}, {:.3}) m\n\
+                 \x20   rotation    ({:8.2}, {:8.2}, {:8.2}) °   σ ({:.2}, {:.2}, {:.2}) °\n\
+                 \x20   {:.0} keypoints support it, at a noise of {:.3} m; as good by chance: once in 10^{:.0}",
+                s[0],
+                s[1],
+                s[2],
+                turn.x,
+                turn.y,
+                turn.z,
+                s[3].to_degrees(),
+                s[4].to_degrees(),
+                s[5].to_degrees(),
+                found.support,
+                found.sigma,
+                -found.log10_nfa
+            );
+        }
+        Err(refused) => {
+            let (what, cure) = words(refused.not.reason);
+            let _ = write!(text, "not aligned: {what}\n    {}\n    {cure}", refused.why);
+        }
+    }
+    if let Some(path) = &outcome.picture {
+        let _ = write!(text, "\n    picture: {}", path.display());
+    }
+    text
+}
+
+pub(super) fn json(outcome: &Outcome) -> Result<String> {
+    let side = |side: &super::side::Side| {
+        let [read, left] = side.points;
+        json!({"name": side.name, "points": read, "thinned": left, "range_m": side.range, "keypoints": side.keypoints.len()})
+    };
+    let submap = &outcome.config.submap;
+    let found = match &outcome.found {
+        Ok(found) => json!({
+            "t_a_b": RelationView::from(&found.t_mine_theirs),
+            "support": found.support,
+            "sigma_m": found.sigma,
+            "log10_nfa": found.log10_nfa,
+        }),
+        Err(_) => Value::Null,
+    };
+    let refused = outcome.found.as_ref().err().map(|refused| {
+        let (what, cure) = words(refused.not.reason);
+        json!({"reason": refused.not.reason, "what": what, "why": refused.why, "cure": cure})
+    });
+    let all = json!({
+        "conventions": "t_a_b maps coordinates in B into A; quaternion [x, y, z, w]; covariance: upper triangle, row by \
+                        row, of the local perturbation (translation m, rotation rad); as in the agents' views",
+        "a": side(&outcome.sides[0]),
+        "b": side(&outcome.sides[1]),
+        "sensor": submap.sensor,
+        "voxel_m": submap.voxel_m,
+        "sigma_max_m": outcome.config.align.sigma_max_voxels * submap.voxel_m,
+        "aligned": outcome.found.is_ok(),
+        "found": found,
+        "refused": refused,
+        "picture": outcome.picture,
+    });
+    Ok(serde_json::to_string_pretty(&all)?)
+}
+
+fn covariance(t_a_b: &Relative) -> nalgebra::Matrix6<f64> {
+    match t_a_b {
+        Relative::Metric(t) => *t.covariance.matrix(),
+        Relative::Similarity(t) => t.covariance.matrix().fixed_view::<6, 6>(0, 0).into_owned(),
+    }
+}
+
+fn sigmas(t_a_b: &Relative) -> [f64; 6] {
+    let matrix = covariance(t_a_b);
+    core::array::from_fn(|k| matrix[(k, k)].sqrt())
+}
+
+/// What a refusal means, and what to try.
+fn words(reason: RefusalReason) -> (&'static str, &'static str) {
+    match reason {
+        RefusalReason::TooFew => {
+            ("too few points match", "try: a smaller --voxel; clouds of more than one scan; is the unit the metre?")
+        }
+        RefusalReason::NoConsensus => (
+            "nothing better than chance",
+            "try: do they overlap by a third? Are points in metres, each seen from its \
+             origin, and --sensor right? A larger --sigma-max for a noisy sensor",
+        ),
+        RefusalReason::Ambiguous => (
+            "the place looks like another, or like itself turned or slid",
+            "try: larger submaps, which show more than one repetition",
+        ),
+        RefusalReason::Degenerate => (
+            "the surfaces leave a direction free, as a corridor or a plane does",
+            "try: larger submaps, which show an end or a corner",
+        ),
+        RefusalReason::PoorFit => (
+            "the best pose does not fit the rest of the two",
+            "try: do they overlap by a sixth at least? Did things move in between?",
+        ),
+        RefusalReason::BadInput => ("the points cannot be used so", "try: the reason says which; --voxel or --sensor"),
+    }
+}
+
+fn name(sensor: &merganser_protocol::config::Sensor) -> String {
+    serde_json::to_value(sensor).ok().and_then(|value| value.as_str().map(Into::into)).unwrap_or_default()
+}
+
+/// Both, drawn over one another as they are, and B where it lies in A.
+pub(super) fn scene(outcome: &Outcome) -> Scene {
+    let t = t_a_b(outcome).map(Relative::sim);
+    let robots = outcome.sides.iter().enumerate().map(|(k, side)| {
+        let there = |p: &Vector3<f64>| if k == 0 { Some(*p) } else { t.map(|t| t * *p) };
+        let origin = there(&Vector3::zeros());
+        Robot {
+            name: format!("{}: {}", ["A", "B"][k], side.name),
+            colour: COLOURS[k].into(),
+            alone: (side.cloud.clone(), vec![Vector3::zeros()]),
+            merged: (side.cloud.iter().filter_map(there).collect(), origin.into_iter().collect()),
+            ..Robot::default()
+        }
+    });
+    let (title, subtitle) = match &outcome.found {
+        Ok(found) => {
+            ("aligned".into(), format!("{:.0} keypoints support it, noise {:.3} m", found.support, found.sigma))
+        }
+        Err(refused) => (format!("not aligned: {}", words(refused.not.reason).0), refused.why.clone()),
+    };
+    Scene { title, subtitle, up: Vector3::z(), robots: robots.collect(), alignments: Vec::new(), in_metres: true }
+}

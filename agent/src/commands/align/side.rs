@@ -1,0 +1,224 @@
+//! One of two things to be aligned: read, cut into a submap, described as a robot describes its own.
+
+use super::AlignArgs;
+use crate::commands::BadInput;
+use crate::recording::{Recording, cloud};
+use anyhow::Result;
+use merganser_protocol::config::{Config, Sensor};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
+use merganser_protocol::submap::{
+    CovarianceOf, Described, Features, Keyframe, Keypoints, Submap, SubmapBuilder, describe,
+};
+use merganser_protocol::time::Stamp;
+use merganser_recording::manifest::CloudFormat;
+use nalgebra::Vector3;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Voxels in the range of a cloud: between the 70 of 0.05 m for a depth camera's 3.5 m and the 110 of 0.5 m for a
+/// LiDAR's 55 m, which `agent/dist/default.toml` advises.
+const VOXELS_IN_RANGE: f64 = 100.0;
+/// Voxels that are suggested, m.
+const VOXELS_M: [f64; 2] = [0.02, 0.5];
+/// Clouds that reach farther are taken for a LiDAR's, m.
+const CAMERA_RANGE: f64 = 10.0;
+/// Side of the cubes in which a range is counted, m.
+const CELL_M: f64 = 0.25;
+/// Standard deviation of the one pose of a cloud, which is where it is by definition.
+const POSE_SIGMA: f64 = 1e-4;
+
+/// What was read.
+pub(super) struct Source {
+    name: String,
+    what: What,
+}
+
+enum What {
+    Cloud(Vec<[f32; 3]>),
+    Recording(Box<Recording>, usize),
+}
+
+/// A described submap.
+pub(super) struct Side {
+    pub name: String,
+    /// Points read, and left after thinning.
+    pub points: [usize; 2],
+    /// 90 % of the surface is nearer to the anchor, m.
+    pub range: f64,
+    pub cloud: Vec<Vector3<f64>>,
+    pub features: Arc<Features>,
+    pub keypoints: Arc<Keypoints>,
+}
+
+/// Reads a cloud, or opens a recording.
+pub(super) fn read(path: &Path, format: Option<CloudFormat>) -> Result<Source> {
+    let name = path.display().to_string();
+    let (folder, number) = numbered(path);
+    if folder.is_dir() {
+        let recording = Recording::open(&folder)?;
+        return Ok(Source { name, what: What::Recording(Box::new(recording), number) });
+    }
+    let format = format.map_or_else(|| format_of(path), Ok)?;
+    let (points, remarks) = cloud::read_remarked(path, format)?;
+    for remark in remarks {
+        console::Term::stderr().write_line(&format!("merganser: {name}: {remark}"))?;
+    }
+    Ok(Source { name, what: What::Cloud(points) })
+}
+
+/// A folder, and which of its submaps, if it is named so.
+fn numbered(path: &Path) -> (PathBuf, usize) {
+    let text = path.to_string_lossy();
+    let split = text.rsplit_once(':').and_then(|(folder, number)| Some((folder, number.parse().ok()?)));
+    match split {
+        Some((folder, number)) if !path.exists() => (folder.into(), number),
+        _ => (path.into(), 0),
+    }
+}
+
+fn format_of(path: &Path) -> Result<CloudFormat> {
+    let ending = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    match &*ending {
+        "ply" => Ok(CloudFormat::Ply),
+        "pcd" => Ok(CloudFormat::Pcd),
+        "bin" => Ok(CloudFormat::KittiBin),
+        _ => Err(BadInput::told(format!(
+            "{}: its name does not end in .ply, .pcd or .bin, and it is no folder; say by --format how it is stored",
+            path.display()
+        ))),
+    }
+}
+
+/// What is asked for, else what a recording says, else what the clouds suggest.
+pub(super) fn config(sources: &[Source; 2], args: &AlignArgs) -> Result<Config> {
+    let recorded = sources.iter().find_map(|source| match &source.what {
+        What::Recording(recording, _) => Some(recording.manifest().config.clone()),
+        What::Cloud(_) => None,
+    });
+    let mut config = recorded.unwrap_or_else(|| suggested(sources));
+    if config.submap.sensor.sees_landmarks() {
+        return Err(BadInput::told(
+            "landmarks are not aligned by this command; run them through `merganser demo --data`",
+        ));
+    }
+    config.submap.sensor = args.sensor.unwrap_or(config.submap.sensor);
+    config.submap.voxel_m = args.voxel.unwrap_or(config.submap.voxel_m);
+    if let Some(sigma) = args.sigma_max {
+        config.align.sigma_max_voxels = sigma / config.submap.voxel_m;
+    }
+    config.validate().map_err(|error| {
+        BadInput::told(match error.key {
+            "align.sigma_max_voxels" => format!(
+                "--sigma-max of {} voxels does not work; use 0.1 to 10 voxels of {} m",
+                error.value, config.submap.voxel_m
+            ),
+            "submap.voxel_m" => format!("--voxel: {}", error.mend),
+            _ => error.to_string(),
+        })
+    })?;
+    Ok(config)
+}
+
+fn suggested(sources: &[Source; 2]) -> Config {
+    let clouds = sources.iter().filter_map(|source| match &source.what {
+        What::Cloud(points) => Some(points),
+        What::Recording(..) => None,
+    });
+    let all: Vec<&[f32; 3]> = clouds.flatten().collect();
+    let is_flat = all.iter().all(|point| point[2] == all[0][2]);
+    let range = range(all.iter().map(|point| Vector3::from(point.map(f64::from))));
+    let mut config = Config::default();
+    config.submap.sensor = match range {
+        _ if is_flat => Sensor::Laser2d,
+        range if range > CAMERA_RANGE => Sensor::Lidar3d,
+        _ => Sensor::Points3d,
+    };
+    // Of two decimals, which is easier to repeat.
+    let voxel = (range / VOXELS_IN_RANGE).clamp(VOXELS_M[0], VOXELS_M[1]);
+    config.submap.voxel_m = (100.0 * voxel).round() / 100.0;
+    config
+}
+
+/// 90 % of the surface is nearer: points are counted once in each cube of [`CELL_M`], since sensors see most of them near.
+fn range(points: impl Iterator<Item = Vector3<f64>>) -> f64 {
+    let cells: BTreeSet<[i64; 3]> = points.map(|p| [0, 1, 2].map(|axis| (p[axis] / CELL_M).round() as i64)).collect();
+    let distance = |cell: [i64; 3]| CELL_M * Vector3::from(cell.map(|steps| steps as f64)).norm();
+    let mut distances: Vec<f64> = cells.into_iter().map(distance).collect();
+    distances.sort_by(f64::total_cmp);
+    distances.get(distances.len() * 9 / 10).copied().unwrap_or(0.0)
+}
+
+impl Source {
+    /// Cuts and describes it.
+    pub(super) fn describe(self, config: &Config) -> Result<Side> {
+        let (submap, read) = match self.what {
+            What::Cloud(points) => of_cloud(&self.name, points, config)?,
+            What::Recording(recording, number) => of_recording(&self.name, &recording, number, config)?,
+        };
+        let Described { features, keypoints, further, .. } = describe(&submap, &config.submap);
+        // All that two robots would fetch for a pair that is worth a second look.
+        let keypoints = further.and_then(|further| keypoints.with_further(&further)).unwrap_or(keypoints);
+        if keypoints.is_empty() && config.submap.sensor != Sensor::Laser2d {
+            return Err(BadInput::told(format!(
+                "{}: no keypoints: {} points are left at {} m, too few that have neighbours; use a smaller --voxel, or \
+                 check the unit",
+                self.name,
+                submap.cloud.len(),
+                config.submap.voxel_m
+            )));
+        }
+        let cloud: Vec<Vector3<f64>> = submap.cloud.iter().map(|p| Vector3::from(p.map(f64::from))).collect();
+        Ok(Side {
+            name: self.name,
+            points: [read, cloud.len()],
+            range: range(cloud.iter().copied()),
+            cloud,
+            features: Arc::new(features),
+            keypoints: Arc::new(keypoints),
+        })
+    }
+}
+
+fn of_cloud(name: &str, points: Vec<[f32; 3]>, config: &Config) -> Result<(Submap, usize)> {
+    let read = points.len();
+    let covariance = Covariance::from_sigmas([POSE_SIGMA; 6]).map_err(|error| BadInput::told(error.to_string()))?;
+    let keyframe = Keyframe {
+        stamp: Stamp(0),
+        session: None,
+        pose: PoseWithCovariance { pose: Se3::identity(), covariance },
+        covariance_of: CovarianceOf::Motion,
+        points,
+        marks: Vec::new(),
+        place: None,
+        up: None,
+    };
+    let mut builder = SubmapBuilder::new(config.submap.clone());
+    let finished = builder.push(keyframe).map_err(|error| BadInput::told(format!("{name}: {error}")))?;
+    let submap = finished.or_else(|| builder.flush());
+    Ok((submap.ok_or_else(|| BadInput::told(format!("{name}: makes no submap")))?, read))
+}
+
+/// The submap of this number, as an agent cuts it.
+fn of_recording(name: &str, recording: &Recording, number: usize, config: &Config) -> Result<(Submap, usize)> {
+    let mut builder = SubmapBuilder::new(config.submap.clone());
+    let (mut found, mut read) = (0, 0);
+    for index in 0..=recording.len() {
+        let finished = if index < recording.len() {
+            let keyframe = recording.keyframe(index)?;
+            let points = keyframe.points.len();
+            let finished = builder.push(keyframe).map_err(|error| BadInput::told(format!("{name}: {error}")))?;
+            read = if finished.is_some() { read } else { read + points };
+            finished
+        } else {
+            builder.flush()
+        };
+        if let Some(submap) = finished {
+            if found == number {
+                return Ok((submap, read));
+            }
+            (found, read) = (found + 1, 0);
+        }
+    }
+    Err(BadInput::told(format!("{name}: there is no submap {number}; the recording has {found}, counted from 0")))
+}
