@@ -88,6 +88,13 @@ impl Context {
         &mut self.rng
     }
 
+    /// Random numbers of their own, that change nothing of the others.
+    pub(super) fn rng_beside(&self, stream: u64) -> ChaCha8Rng {
+        let mut rng = self.rng.clone();
+        rng.set_stream(stream);
+        rng
+    }
+
     pub(super) fn now(&self) -> Instant {
         self.now
     }

@@ -8,18 +8,28 @@ use crate::ids::RobotId;
 use crate::time::Instant;
 use crate::wire::messages::Message;
 use crate::wire::{BeaconAge, Life, LifeContent, Nonce};
+use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 
 /// Proofs that are signed each second at most: whoever asks is not known, and a signature costs some 30 µs.
 pub const PROOFS_PER_SEC: u32 = 50;
 
-/// What answers need.
-#[derive(Default)]
+/// Stream of the numbers that are drawn for questions.
+const NONCES: u64 = 1;
+
+/// What questions and answers need.
 pub(super) struct Lives {
+    rng: ChaCha8Rng,
     /// The last beacon of ours that went out.
     pub(super) latest: Option<BeaconAge>,
     /// The second that began then, and how many proofs were signed in it.
     signed: Option<(Instant, u32)>,
+}
+
+impl Lives {
+    pub(super) fn new(context: &Context) -> Self {
+        Self { rng: context.rng_beside(NONCES), latest: None, signed: None }
+    }
 }
 
 impl Replication {
@@ -28,7 +38,7 @@ impl Replication {
         if self.may_speak(context) {
             self.beacons.asked(robot, context.now());
             let mut nonce = Nonce::default();
-            context.rng().fill_bytes(&mut nonce);
+            self.lives.rng.fill_bytes(&mut nonce);
             self.ask(context, robot, QueryKind::Life, &Message::LifeRequest { nonce }, About::Life(nonce));
         }
     }

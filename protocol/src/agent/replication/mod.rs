@@ -58,7 +58,7 @@ impl Replication {
             ledger: Ledger::default(),
             gossip: Gossip::new(context.robot(), &context.config().gossip, context.now()),
             beacons: Beacons::new(context.now()),
-            lives: Lives::default(),
+            lives: Lives::new(context),
             blobs: Blobs::default(),
             condensing: Condensing::default(),
         }
