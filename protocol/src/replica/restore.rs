@@ -36,10 +36,17 @@ pub struct Damage {
 /// Parts of the store are damaged. All that is sound is loaded; the rest can be fetched from neighbours, except in a
 /// log of this robot's own, which must not be continued: begin a new epoch.
 #[derive(Clone, Debug, Error, PartialEq)]
-#[error("{} stored entries are damaged or out of reach, first {:?}", .damaged.len(), .damaged.first())]
+#[error("{} stored entries cannot be used, the first {}", .damaged.len(), first(.damaged))]
 pub struct RestoreError {
     /// Each of them, in canonical order.
     pub damaged: Vec<Damage>,
+}
+
+fn first(damaged: &[Damage]) -> String {
+    let Some(Damage { id, why }) = damaged.first() else { return String::new() };
+    let id = id.map_or_else(|| "of unreadable place".into(), |id| id.to_string());
+    let why = why.as_ref().map_or_else(|| "an entry before it is missing".into(), ToString::to_string);
+    format!("{id}: {why}")
 }
 
 impl RestoreError {

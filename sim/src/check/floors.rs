@@ -1,6 +1,6 @@
-//! Nothing below a floor returns (DESIGN §8.4): once a robot's disk has dropped what a writer replaced, no entry below
-//! that place is put on it again, in no later run, and the robot offers none to others. A disk that was wiped, or that
-//! lost what it had confirmed, is excused.
+//! Nothing below a floor returns (DESIGN §8.4): once a robot's disk has dropped what a writer replaced, or a log that it
+//! gave up, no entry below that place, or of that log, is put on it again, in no later run, and the robot offers none to
+//! others. A disk that was wiped, or that lost what it had confirmed, is excused.
 
 use super::pending::Pending;
 use super::{Check, Seen};
@@ -32,6 +32,8 @@ impl Disk {
             match record {
                 Record::Entry { id, .. } => self.above(id.frame, id.seq)?,
                 Record::Replaced { below, .. } => self.waiting.hand_over(batch, [(below.frame, below.seq)]),
+                // No entry has the last place of all.
+                Record::Retired { frame, .. } => self.waiting.hand_over(batch, [(*frame, u32::MAX)]),
                 _ => {}
             }
         }
@@ -103,6 +105,17 @@ mod tests {
 
     fn floor(seq: u32) -> Record {
         Record::Replaced { below: EntryId { frame: FRAME, seq }, submaps: vec![], blobs: vec![] }
+    }
+
+    #[test]
+    fn an_entry_of_a_log_that_was_given_up_is_seen() {
+        let mut check = Floors::default();
+        let retired = Record::Retired { frame: FRAME, submaps: vec![], blobs: vec![] };
+        hand_over(&mut check, 0, retired).unwrap();
+        assert!(hand_over(&mut check, 0, entry(400)).is_ok(), "not on disk yet");
+        check.see(0, &Seen::Durable(1)).unwrap();
+        assert!(hand_over(&mut check, 0, entry(400)).is_err());
+        assert!(hand_over(&mut check, 1, entry(400)).is_ok(), "another robot has not heard of it");
     }
 
     #[test]

@@ -163,6 +163,9 @@ fn machine(dice: &mut Dice) -> MachineOptions {
     }
 }
 
+/// Share of the runs in which robots may have one to three epochs each.
+const FEW_EPOCHS_SHARE: f64 = 0.3;
+
 fn config(robots: usize, dice: &mut Dice) -> Config {
     let mut config = Config::default();
     config.submap.voxel_m = 0.4;
@@ -183,6 +186,11 @@ fn config(robots: usize, dice: &mut Dice) -> Config {
     let (slow, bytes_per_sec) = (dice.chance(SLOW_LINK_SHARE), dice.range(SLOW_LINK[0], SLOW_LINK[1]));
     if slow {
         config.gossip.link_bytes_per_sec = bytes_per_sec * robots.max(CROWD) as f64 / CROWD as f64;
+    }
+    // Robots begin few epochs in a run; in some runs they give up old ones all the same.
+    let (few, epochs) = (dice.chance(FEW_EPOCHS_SHARE), 1 + dice.bits() as usize % 3);
+    if few {
+        config.gossip.epochs_per_robot_max = epochs;
     }
     config
 }

@@ -10,7 +10,6 @@ use anyhow::{Context, Result};
 use merganser_protocol::agent::job::{AlignJob, Measured, Refused};
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::geometry::Relative;
-use merganser_protocol::wire::fact::ScaleKind;
 use merganser_recording::manifest::CloudFormat;
 use side::Side;
 use std::path::PathBuf;
@@ -29,7 +28,7 @@ pub struct AlignArgs {
     /// clouds, what their extent suggests.
     #[arg(long, value_name = "SENSOR", value_parser = sensor)]
     pub sensor: Option<Sensor>,
-    /// Thinning, m: about a sixtieth of the range. Without it, what a recording says or the clouds' extent suggests.
+    /// Thinning, m: about a hundredth of the range. Without it, what a recording says or the clouds' extent suggests.
     #[arg(long, value_name = "M", value_parser = length)]
     pub voxel: Option<f64>,
     /// Largest noise of matched points, m; 1.5 voxels without it.
@@ -124,7 +123,7 @@ fn look([a, b]: &[Side; 2], config: &Config, seed: u64) -> Result<Measured, Refu
         voxel_m: config.submap.voxel_m,
         sensor: config.submap.sensor,
         verticals: None,
-        scale: ScaleKind::Metric,
+        scale: config.submap.scale,
         seed,
     };
     job.look()

@@ -13,6 +13,9 @@ use std::fmt::Write as _;
 /// Colours that colour-blind people tell apart (Okabe and Ito).
 const COLOURS: [&str; 2] = ["#0072b2", "#d55e00"];
 
+/// No sensor on a robot sees farther, m.
+const RANGE_MAX: f64 = 500.0;
+
 pub(super) fn text(outcome: &Outcome) -> String {
     let mut text = String::new();
     let submap = &outcome.config.submap;
@@ -23,6 +26,13 @@ pub(super) fn text(outcome: &Outcome) -> String {
             text,
             "{letter}  {name}: {read} points, nine in ten within {:.1} m; {left} left, {keypoints} keypoints",
             side.range
+        );
+    }
+    if let Some(far) = outcome.sides.iter().find(|side| side.range > RANGE_MAX) {
+        let _ = writeln!(
+            text,
+            "   {} reaches {:.0} m: are these millimetres, or a map's coordinates?",
+            far.name, far.range
         );
     }
     let sigma = outcome.config.align.sigma_max_voxels * submap.voxel_m;

@@ -92,11 +92,20 @@ fn format_of(path: &Path) -> Result<CloudFormat> {
 
 /// What is asked for, else what a recording says, else what the clouds suggest.
 pub(super) fn config(sources: &[Source; 2], args: &AlignArgs) -> Result<Config> {
-    let recorded = sources.iter().find_map(|source| match &source.what {
+    let recorded = |source: &Source| match &source.what {
         What::Recording(recording, _) => Some(recording.manifest().config.clone()),
         What::Cloud(_) => None,
-    });
-    let mut config = recorded.unwrap_or_else(|| suggested(sources));
+    };
+    let [a, b] = [0, 1].map(|k| recorded(&sources[k]));
+    if let (Some(a), Some(b), None) = (&a, &b, args.sensor)
+        && a.submap.sensor != b.submap.sensor
+    {
+        return Err(BadInput::told(format!(
+            "{} and {} are of different sensors, which robots do not compare; choose one by --sensor",
+            sources[0].name, sources[1].name
+        )));
+    }
+    let mut config = a.or(b).unwrap_or_else(|| suggested(sources));
     if config.submap.sensor.sees_landmarks() {
         return Err(BadInput::told(
             "landmarks are not aligned by this command; run them through `merganser demo --data`",
