@@ -1,12 +1,14 @@
 //! What a robot holds never shrinks (DESIGN §8.3, §8.4, and no acknowledged fact is lost): a log that was durable on a
 //! robot's disk up to some place is so at every later moment and after every restart, a log in quarantine stays there,
 //! and the robot's own epoch does not fall, nor does it return to one that its disk knows as closed. A disk that was
-//! wiped, or that lost what it had confirmed, is excused.
+//! wiped, or that lost what it had confirmed, is excused, and so are logs that their writer gave up by an entry that is
+//! durable.
 
 use super::pending::Pending;
 use super::{Check, RobotSample, Sample, Seen};
 use merganser_protocol::agent::io::{Output, Record};
-use merganser_protocol::ids::{EntryId, FrameId};
+use merganser_protocol::ids::{EntryId, FrameId, RobotId};
+use merganser_protocol::wire::{Entry, Fact};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// See the module.
@@ -21,7 +23,8 @@ struct Held {
     epoch: u32,
     /// The first epoch that the disk does not know as closed.
     open: u32,
-    entries: Pending<EntryId>,
+    /// With the first epoch that the writer keeps, if the entry says so.
+    entries: Pending<(EntryId, Option<u32>)>,
     closing: Pending<u32>,
     /// The last batch handed to the disk, and the last that is on it.
     batches: [u64; 2],
@@ -55,6 +58,13 @@ impl Held {
         self.quarantined.clear();
         self.closing.lose();
         (self.epoch, self.open) = (0, 0);
+    }
+
+    /// The writer keeps no epoch below this one, nor does anybody else have to.
+    fn retire(&mut self, robot: RobotId, first: u32) {
+        let stays = |frame: &FrameId| frame.robot != robot || frame.epoch >= first;
+        self.logs.retain(|frame, _| stays(frame));
+        self.quarantined.retain(|frame, _| stays(frame));
     }
 
     fn compare(&mut self, robot: &RobotSample) -> Result<(), String> {
@@ -103,7 +113,7 @@ impl Check for NeverBack {
                 held.batches[0] = *batch;
                 for record in records {
                     match record {
-                        Record::Entry { id, .. } => held.entries.hand_over(*batch, [*id]),
+                        Record::Entry { id, bytes } => held.entries.hand_over(*batch, [(*id, kept_from(bytes))]),
                         Record::EpochClosed { epoch } => held.closing.hand_over(*batch, [*epoch]),
                         _ => {}
                     }
@@ -111,8 +121,11 @@ impl Check for NeverBack {
             }
             Seen::Durable(batch) => {
                 held.batches[1] = *batch;
-                for id in held.entries.durable(*batch) {
+                for (id, first) in held.entries.durable(*batch) {
                     held.logs.entry(id.frame).or_default().add(id.seq);
+                    if let Some(first) = first {
+                        held.retire(id.frame.robot, first.min(id.frame.epoch));
+                    }
                 }
                 for epoch in held.closing.durable(*batch) {
                     held.open = held.open.max(epoch.saturating_add(1));
@@ -136,12 +149,22 @@ impl Check for NeverBack {
     }
 }
 
+/// The first epoch that an entry's writer keeps, if it says so.
+fn kept_from(entry: &[u8]) -> Option<u32> {
+    match Entry::decode(entry).ok()?.fact().ok()? {
+        Fact::Retired(fact) => Some(fact.below.get()),
+        _ => None,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::tests::{robot, sample};
     use super::*;
     use crate::scenario::Expect;
-    use merganser_protocol::ids::RobotId;
+    use merganser_protocol::ids::{Hash, Name};
+    use merganser_protocol::wire::fact::RetiredFact;
+    use merganser_protocol::wire::{EntryContent, SwarmTag};
 
     const FRAME: FrameId = FrameId { robot: RobotId([1; 8]), epoch: 4 };
 
@@ -169,6 +192,43 @@ mod tests {
         let mut check = NeverBack::default();
         store(&mut check, 0..3);
         assert!(look(&mut check, Some(2)).is_err(), "what the disk confirmed counts, seen or not");
+    }
+
+    /// Of the log of this epoch, an entry that gives up those below `below`.
+    fn retires(check: &mut NeverBack, epoch: u32, below: u32) {
+        let key = ed25519_dalek::SigningKey::from_bytes(&[1; 32]);
+        let id = EntryId { frame: FrameId { epoch, ..FRAME }, seq: 0 };
+        let fact = Fact::Retired(RetiredFact { below: below.try_into().unwrap() });
+        let content = EntryContent {
+            swarm: SwarmTag::of(&Name::new("test").unwrap()),
+            id,
+            kind: fact.kind(),
+            floor: 0,
+            previous: Hash::default(),
+            payload: fact.to_payload().unwrap(),
+        };
+        let record = Record::Entry { id, bytes: Entry::sign(&key, content).unwrap().encode() };
+        check.see(0, &Seen::Output(&Output::Persist { batch: 2, records: vec![record] })).unwrap();
+    }
+
+    #[test]
+    fn a_log_may_go_once_its_writer_has_durably_given_it_up_and_no_sooner() {
+        for (epoch, below, durable, may) in
+            [(9, 9, true, true), (9, 5, true, true), (9, 4, true, false), (9, 9, false, false), (4, 9, true, false)]
+        {
+            let mut check = NeverBack::default();
+            store(&mut check, 0..3);
+            retires(&mut check, epoch, below);
+            if durable {
+                check.see(0, &Seen::Durable(2)).unwrap();
+            }
+            let mut one = robot("alpha", 1, &[]);
+            if epoch > FRAME.epoch && durable {
+                one.logs.insert(FrameId { epoch, ..FRAME }, Some(1));
+            }
+            let gone = check.sample(&sample(vec![one], &BTreeMap::new(), &Expect::default()));
+            assert_eq!(gone.is_ok(), may, "{epoch} {below} {durable}");
+        }
     }
 
     #[test]
