@@ -1,10 +1,7 @@
 //! `merganser align`: what two clouds come to, and what is told where they come to nothing.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
-mod common;
-
-use common::keyframe;
-use merganser::recording::cloud;
+use merganser::recording::{Recording, cloud};
 use merganser_protocol::geometry::{Se3, So3};
 use merganser_recording::manifest::CloudFormat;
 use nalgebra::{Matrix6, Vector3};
@@ -12,12 +9,12 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// The cloud of a keyframe of the common room, of several scans, as a file; and where its body was.
-fn cloud_of(folder: &Path, robot: u64, index: u64, name: &str, format: CloudFormat) -> (PathBuf, Se3) {
-    let seen = keyframe(robot, index);
+/// One scan of a recording, as a file; and where its body truly was.
+fn cloud_of(folder: &Path, index: usize, name: &str, format: CloudFormat) -> (PathBuf, Se3) {
+    let recording = Recording::open(Path::new("recordings/alpha")).unwrap();
     let path = folder.join(name);
-    std::fs::write(&path, cloud::encode(&seen.points, format).unwrap()).unwrap();
-    (path, seen.pose.pose)
+    std::fs::write(&path, cloud::encode(&recording.points(index).unwrap(), format).unwrap()).unwrap();
+    (path, recording.truth().unwrap()[index].pose)
 }
 
 fn align(args: &[&str]) -> Output {
@@ -48,16 +45,16 @@ fn relation(value: &Value) -> (Se3, Matrix6<f64>) {
 }
 
 #[test]
-fn two_clouds_of_a_room_align_where_they_truly_lie_whatever_they_are_stored_as() {
+fn two_scans_align_where_they_truly_lie_whatever_they_are_stored_as() {
     let dir = tempfile::tempdir().unwrap();
-    let (a, t_room_a) = cloud_of(dir.path(), 0, 1, "a.ply", CloudFormat::Ply);
-    let (b, t_room_b) = cloud_of(dir.path(), 1, 4, "b.bin", CloudFormat::KittiBin);
+    let (a, t_world_a) = cloud_of(dir.path(), 6, "a.ply", CloudFormat::Ply);
+    let (b, t_world_b) = cloud_of(dir.path(), 10, "b.bin", CloudFormat::KittiBin);
     let picture = dir.path().join("both.png");
     let output = align(&[a.to_str().unwrap(), b.to_str().unwrap(), "--json", "--picture", picture.to_str().unwrap()]);
     assert_eq!(output.status.code(), Some(0), "{output:?}");
     let told = json(&output);
     let (t_a_b, covariance) = relation(&told);
-    let error = (t_room_a.inverse() * t_room_b).local(&t_a_b);
+    let error = (t_world_a.inverse() * t_world_b).local(&t_a_b);
     let nees = error.dot(&(covariance.try_inverse().unwrap() * error));
     assert!(error.fixed_rows::<3>(0).norm() < 0.05 && error.fixed_rows::<3>(3).norm() < 0.02, "{error}");
     assert!(nees < 22.46, "{nees}, beyond 99.9 %");
@@ -90,7 +87,7 @@ fn submaps_of_recordings_are_aligned_by_their_number() {
 #[test]
 fn what_does_not_align_is_told_with_what_was_found_and_what_to_try() {
     let dir = tempfile::tempdir().unwrap();
-    let (a, _) = cloud_of(dir.path(), 0, 1, "a.ply", CloudFormat::Ply);
+    let (a, _) = cloud_of(dir.path(), 6, "a.ply", CloudFormat::Ply);
     // Other surfaces: a ball.
     let ball: Vec<[f32; 3]> = (0..4000)
         .map(|k| {
@@ -115,7 +112,7 @@ fn what_does_not_align_is_told_with_what_was_found_and_what_to_try() {
 #[test]
 fn bad_input_is_told_with_the_file_and_the_cure() {
     let dir = tempfile::tempdir().unwrap();
-    let (a, _) = cloud_of(dir.path(), 0, 1, "a.ply", CloudFormat::Ply);
+    let (a, _) = cloud_of(dir.path(), 6, "a.ply", CloudFormat::Ply);
     let a = a.to_str().unwrap();
     let file = |name: &str, bytes: &[u8]| {
         let path = dir.path().join(name);

@@ -21,6 +21,8 @@ use std::sync::Arc;
 const VOXELS_IN_RANGE: f64 = 100.0;
 /// Voxels that are suggested, m.
 const VOXELS_M: [f64; 2] = [0.02, 0.5];
+/// Points that a voxel holds at least, on average, of a cloud that it thins.
+const POINTS_IN_VOXEL: usize = 2;
 /// Clouds that reach farther are taken for a LiDAR's, m.
 const CAMERA_RANGE: f64 = 10.0;
 /// Side of the cubes in which a range is counted, m.
@@ -136,24 +138,32 @@ fn suggested(sources: &[Source; 2]) -> Config {
     });
     let all: Vec<&[f32; 3]> = clouds.flatten().collect();
     let is_flat = all.iter().all(|point| point[2] == all[0][2]);
-    let range = range(all.iter().map(|point| Vector3::from(point.map(f64::from))));
+    let range = range(all.iter().copied());
     let mut config = Config::default();
     config.submap.sensor = match range {
         _ if is_flat => Sensor::Laser2d,
         range if range > CAMERA_RANGE => Sensor::Lidar3d,
         _ => Sensor::Points3d,
     };
+    let mut voxel = (range / VOXELS_IN_RANGE).clamp(VOXELS_M[0], VOXELS_M[1]);
+    // In a cloud that hardly gets thinner, points are farther apart than this: it shows no surfaces at such a scale.
+    while all.len() < POINTS_IN_VOXEL * cells(all.iter().copied(), voxel).len() && voxel < VOXELS_M[1] {
+        voxel *= 1.2;
+    }
     // Of two decimals, which is easier to repeat.
-    let voxel = (range / VOXELS_IN_RANGE).clamp(VOXELS_M[0], VOXELS_M[1]);
-    config.submap.voxel_m = (100.0 * voxel).round() / 100.0;
+    config.submap.voxel_m = (100.0 * voxel.min(VOXELS_M[1])).round() / 100.0;
     config
 }
 
+/// The cubes of this side that hold a point.
+fn cells<'a>(points: impl Iterator<Item = &'a [f32; 3]>, side: f64) -> BTreeSet<[i64; 3]> {
+    points.map(|point| point.map(|c| (f64::from(c) / side).round() as i64)).collect()
+}
+
 /// 90 % of the surface is nearer: points are counted once in each cube of [`CELL_M`], since sensors see most of them near.
-fn range(points: impl Iterator<Item = Vector3<f64>>) -> f64 {
-    let cells: BTreeSet<[i64; 3]> = points.map(|p| [0, 1, 2].map(|axis| (p[axis] / CELL_M).round() as i64)).collect();
+fn range<'a>(points: impl Iterator<Item = &'a [f32; 3]>) -> f64 {
     let distance = |cell: [i64; 3]| CELL_M * Vector3::from(cell.map(|steps| steps as f64)).norm();
-    let mut distances: Vec<f64> = cells.into_iter().map(distance).collect();
+    let mut distances: Vec<f64> = cells(points, CELL_M).into_iter().map(distance).collect();
     distances.sort_by(f64::total_cmp);
     distances.get(distances.len() * 9 / 10).copied().unwrap_or(0.0)
 }
@@ -181,7 +191,7 @@ impl Source {
         Ok(Side {
             name: self.name,
             points: [read, cloud.len()],
-            range: range(cloud.iter().copied()),
+            range: range(submap.cloud.iter()),
             cloud,
             features: Arc::new(features),
             keypoints: Arc::new(keypoints),
