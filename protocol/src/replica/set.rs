@@ -120,7 +120,7 @@ impl IngestError {
         match self {
             Self::FloorMoved(id) | Self::TooEarly(id) => Some(id.frame.robot),
             Self::Fork(frame) => Some(frame.robot),
-            // Only what it signed fills its share.
+            // Looked at after the signature.
             Self::BytesLimit(robot) => Some(*robot),
             Self::Entry(_)
             | Self::Swarm(_)
@@ -212,8 +212,8 @@ impl Replica {
         }
         self.check_epoch(&entry)?;
         self.check_place(id, entry.floor())?;
-        self.check_bytes(&entry, bytes.len())?;
         self.verify(&entry)?;
+        self.check_bytes(&entry, bytes.len())?;
 
         let next = self.next_seq(frame);
         if id.seq > next && entry.floor() == id.seq {
@@ -322,6 +322,12 @@ impl Replica {
     #[must_use]
     pub fn verify_beacon(&self, beacon: &Beacon) -> bool {
         self.members.get(&beacon.robot()).is_some_and(|member| beacon.verify(&member.key, self.swarm))
+    }
+
+    /// Whether these bytes are an entry of this swarm that the robot it names has signed.
+    #[must_use]
+    pub fn is_signed(&self, bytes: &[u8]) -> bool {
+        self.admit(bytes).is_ok_and(|entry| self.verify(&entry).is_ok())
     }
 
     /// Whether a proof of life comes from the member it names.

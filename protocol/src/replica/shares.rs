@@ -101,10 +101,10 @@ impl Replica {
 
     /// Drops the logs that the durable entries of this one give up.
     pub(super) fn retire(&mut self, frame: FrameId) {
-        let Some(first) = self.log(frame).and_then(Log::retires) else { return };
-        if self.first_epoch(frame.robot).is_some_and(|known| known >= first) {
-            return;
-        }
+        let known = self.first_epoch(frame.robot).unwrap_or_default();
+        // Most logs give up nothing: those need not be looked through each time.
+        let log = self.log(frame).filter(|log| log.stays() > known);
+        let Some(first) = log.and_then(Log::retires).filter(|first| *first > known) else { return };
         self.retired.insert(frame.robot, first);
         let gone: Vec<FrameId> = self.slots_of(frame.robot).map(|(frame, _)| *frame).collect();
         for frame in gone.into_iter().filter(|frame| frame.epoch < first) {

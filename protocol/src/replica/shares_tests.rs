@@ -152,6 +152,10 @@ fn a_member_fills_its_share_and_no_more_and_others_are_not_touched() {
     assert_eq!((&refused, refused.culprit()), (&IngestError::BytesLimit(robot), Some(robot)));
     assert_eq!(replica.ingest(&large(1, 2, 1)[0]), Err(IngestError::BytesLimit(robot)), "over all its epochs");
     assert!(matches!(replica.ingest(&large(2, 1, 1)[0]), Ok(Ingested::New(_))), "another's share is its own");
+    // Nobody is blamed for what he did not sign.
+    let mut forged = entries[fit].clone();
+    *forged.last_mut().unwrap() ^= 1;
+    assert_eq!(replica.ingest(&forged).unwrap_err().culprit(), None);
     // It is not asked for what would be refused.
     let mut full = testing::replica();
     feed(&mut full, &entries);

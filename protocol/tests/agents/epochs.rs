@@ -210,6 +210,27 @@ fn own_epochs_that_come_back_in_any_number_hinder_nobody() {
     assert!(wires.agents[1].heads().any(|(frame, _)| frame.epoch == epoch), "what alpha wrote last");
 }
 
+/// Somebody without a key sends what looks like our past: it makes us give up nothing.
+#[test]
+fn a_past_that_we_did_not_sign_begins_no_epoch() {
+    for signed in [false, true] {
+        let mut config = super::common::config();
+        config.gossip.epochs_per_robot_max = 1;
+        let restored = Restored { records: vec![], fresh_epoch: 12 };
+        let alpha = Agent::new(config, super::common::identity(0), 0, restored, Instant::ZERO).unwrap();
+        let mut wires = Wires::new(vec![alpha]);
+        writes(&mut wires);
+        let (before, digest) = (wires.agents[0].frame().epoch, wires.agents[0].digest());
+        let mut entries = past(3, 0..1);
+        if !signed {
+            *entries[0].last_mut().unwrap() ^= 1;
+        }
+        hear(&mut wires, &entries);
+        assert_eq!(wires.agents[0].frame().epoch > before, signed);
+        assert_eq!(wires.agents[0].digest(), digest, "until something is written");
+    }
+}
+
 #[test]
 fn of_a_submap_that_cannot_be_stated_nothing_is_kept() {
     let mut alpha = agent(0, Restored { records: vec![], fresh_epoch: 2 });
