@@ -29,7 +29,7 @@ fn the_help_is_the_one_we_reviewed() {
 #[test]
 fn every_subcommand_has_help_and_every_option_a_text() {
     let dir = tempfile::tempdir().unwrap();
-    for subcommand in ["demo", "run", "watch", "check", "keys", "store", "graph", "replay"] {
+    for subcommand in ["demo", "run", "align", "watch", "check", "keys", "store", "graph", "replay"] {
         let told = merganser(&[subcommand, "--help"], dir.path());
         assert_eq!(told.status.code(), Some(0), "{subcommand}");
         assert!(text(&told.stdout).contains("Usage: merganser"), "{subcommand}");
