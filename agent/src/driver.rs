@@ -310,8 +310,8 @@ fn tell(event: &Event) {
             robot,
             first,
             count,
-            "it began more epochs than gossip.epochs_per_robot_max or its share of gossip.facts_bytes_max allow, and gave \
-             up its oldest with their maps; if its SLAM does not restart that often, see that one process alone runs \
+            "it began more epochs than gossip.epochs_per_robot_max or its share of gossip.facts_bytes_max allow: its oldest \
+             are gone with their maps; if its SLAM does not restart that often, see that one process alone runs \
              under its key"
         ),
         Event::EpochBegan { frame, reason } => info!(%frame, reason = reason.text(), "a new epoch begins"),

@@ -271,7 +271,7 @@ pub enum Record {
         /// Keypoint blobs that no submap of ours names any more.
         blobs: Vec<Hash>,
     },
-    /// A log that its writer gave up: entries and proof are to be taken off the disk.
+    /// A log that its writer gave up, or that is older than as many as are held: entries and proof are to be taken off the disk.
     Retired {
         /// The log.
         frame: FrameId,
@@ -424,7 +424,7 @@ pub enum Event {
         /// In what way.
         oddity: Oddity,
     },
-    /// A robot gave up its oldest epochs, to have room for a new one. Their maps are gone.
+    /// A robot's oldest epochs made room for a new one. Their maps are gone.
     EpochsRetired {
         /// The robot's name.
         robot: String,

@@ -78,9 +78,13 @@ impl Agent {
         false
     }
 
-    /// States a fact in the present epoch. False if it cannot be written.
+    /// States a fact: in the present epoch, but while submaps of an earlier one wait to be described, in that one. The
+    /// first fact of an epoch closes those before it, and their last submaps would be lost. False if it cannot be
+    /// written.
     fn state(&mut self, fact: &Fact) -> bool {
-        self.write(self.context.frame().epoch, fact)
+        let present = self.context.frame().epoch;
+        let earlier = self.mapping.first_undescribed().map(|id| id.frame.epoch).filter(|epoch| *epoch < present);
+        earlier.is_some_and(|epoch| self.write(epoch, fact)) || self.write(present, fact)
     }
 
     /// Writes a fact of our own. False if it cannot be written.
@@ -279,12 +283,6 @@ impl Agent {
             Heard::Forked(frame) => {
                 self.on_fork(frame);
                 return true;
-            }
-            // Others hold more of our past than they may: an epoch that gives some of it up makes room.
-            Heard::Crowded => {
-                if self.replication.is_begun(&self.context) {
-                    self.begin_next_epoch(EpochReason::Log);
-                }
             }
             Heard::Nothing => {}
         }

@@ -29,8 +29,7 @@ pub enum AppendError {
         /// The latest one.
         latest: u32,
     },
-    /// No epoch can follow this robot's last one, or nobody would take another: its older ones were not
-    /// [given up](Replica::to_retire) first.
+    /// No epoch can follow this robot's last one; or it begins them faster than its disk keeps them.
     #[error("{0} has no epoch left that others would take; give the robot a new key")]
     EpochLimit(RobotId),
     /// The log is full or quarantined, or others hold entries of it that this robot did not write in this run or load
@@ -116,7 +115,7 @@ impl Replica {
         }
         let (kind, payload) = (fact.kind(), fact.to_payload()?);
         let entry = Entry::sign(key, EntryContent { swarm: self.swarm, id, kind, floor, previous, payload })?;
-        if self.check_epoch(&entry).is_err() {
+        if self.check_epoch(frame).is_err() {
             return Err(AppendError::EpochLimit(robot));
         }
         if self.check_bytes(&entry, entry.encode().len()).is_err() {

@@ -32,7 +32,7 @@ impl Replica {
         if self.is_retired(frame) {
             return Ok((frame, false));
         }
-        self.check_epoch(&first)?;
+        self.check_epoch(frame)?;
         self.verify(&first)?;
         self.verify(&second)?;
         self.quarantine(frame, a, b);
@@ -57,6 +57,7 @@ impl Replica {
         let proof = ForkProof { a: a.to_vec(), b: b.to_vec() };
         self.slots.insert(frame, Slot::Forked(proof));
         self.digest.take();
+        self.retire(frame);
     }
 }
 

@@ -101,8 +101,7 @@ impl Replica {
 
     /// Loads the longest sound prefix of the log; gives back the other records.
     fn restore_chain(&mut self, frame: FrameId, records: Vec<Stored>) -> Vec<Stored> {
-        let begins = records.first().filter(|record| record.seq == 0).and_then(|record| record.retires);
-        if self.slots.contains_key(&frame) || self.check_room(frame, begins).is_err() {
+        if self.slots.contains_key(&frame) || self.check_epoch(frame).is_err() {
             return records;
         }
         let first = records.first().filter(|record| record.floor == record.seq).map_or(0, |record| record.seq);

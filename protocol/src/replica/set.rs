@@ -28,9 +28,9 @@ pub struct Replica {
     pub(super) roster_hash: [u8; 4],
     /// The digest, until the set changes.
     pub(super) digest: OnceCell<Hash>,
-    /// First epoch of each robot that it has not given up, as far as it said so.
+    /// First epoch of each robot that may be held: older ones it gave up, or they were too many.
     pub(super) retired: BTreeMap<RobotId, u32>,
-    /// Logs that were given up since the last [`Replica::take_gone`].
+    /// Logs that were dropped since the last [`Replica::take_gone`].
     pub(super) gone: Vec<FrameId>,
     pub(super) entries_per_frame_max: u32,
     pub(super) epochs_per_robot_max: usize,
@@ -86,8 +86,8 @@ pub enum IngestError {
     /// Of a robot that is not in the roster.
     #[error("robot {0} is not in the roster")]
     UnknownOrigin(RobotId),
-    /// The robot has as many epochs as are held, and gave none of them up first.
-    #[error("robot {0} has more epochs than gossip.epochs_per_robot_max")]
+    /// It is the last epoch of all, or as many of this robot's as are held already wait for the disk.
+    #[error("robot {0} begins epochs faster than they can be kept, or its last one of all")]
     EpochLimit(RobotId),
     /// The robot's entries take as much as is granted to each member.
     #[error("robot {0} has filled its share of gossip.facts_bytes_max; others are not touched")]
@@ -210,7 +210,7 @@ impl Replica {
             Some(Slot::Log(log)) if log.early.get(&id.seq) == Some(&entry) => return Ok(Ingested::Early(id)),
             _ => {}
         }
-        self.check_epoch(&entry)?;
+        self.check_epoch(frame)?;
         self.check_place(id, entry.floor())?;
         self.verify(&entry)?;
         self.check_bytes(&entry, bytes.len())?;
@@ -322,12 +322,6 @@ impl Replica {
     #[must_use]
     pub fn verify_beacon(&self, beacon: &Beacon) -> bool {
         self.members.get(&beacon.robot()).is_some_and(|member| beacon.verify(&member.key, self.swarm))
-    }
-
-    /// Whether these bytes are an entry of this swarm that the robot it names has signed.
-    #[must_use]
-    pub fn is_signed(&self, bytes: &[u8]) -> bool {
-        self.admit(bytes).is_ok_and(|entry| self.verify(&entry).is_ok())
     }
 
     /// Whether a proof of life comes from the member it names.

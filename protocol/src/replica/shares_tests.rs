@@ -43,7 +43,6 @@ fn the_seventieth_epoch_is_like_the_second() {
     let max = GossipConfig::default().epochs_per_robot_max as u32;
     for epoch in 1..=70 {
         let entries = write(&mut writer, 1, epoch, &fact(epoch));
-        assert_eq!(entries.len(), 1 + usize::from(epoch > max), "one goes for each that comes");
         feed(&mut reader, &entries);
         assert_eq!(view(&reader), view(&writer));
     }
@@ -87,17 +86,44 @@ fn nobody_gives_up_what_is_to_come_or_anothers() {
     assert_eq!(replica.first_epoch(frame(1, 0).robot), Some(5));
 }
 
-/// A later place of a log that is not held makes no room, however much it gives up: nothing can be done with it yet.
+/// Later places of logs that are not begun crowd nothing out, and wait in bounded memory.
 #[test]
-fn only_the_first_entry_of_a_log_makes_room_for_it() {
+fn a_log_whose_beginning_is_missing_takes_nobodys_place() {
     let mut replica = of_epochs(2);
     feed(&mut replica, &[chain(1, 0, 1, 0), chain(1, 1, 1, 0)].concat());
     for epoch in 2..200 {
         let first = signed(1, epoch, 0, 0, Hash::default(), &fact(0));
         let second = signed(1, epoch, 1, 0, first.hash(), &retired(epoch)).encode();
-        assert_eq!(replica.ingest(&second), Err(IngestError::EpochLimit(frame(1, 0).robot)));
+        let taken = replica.ingest(&second);
+        assert_eq!(
+            matches!(taken, Ok(Ingested::Early(_))),
+            epoch < 2 + EARLY_PER_ROBOT_MAX as u32,
+            "{epoch}: {taken:?}"
+        );
     }
-    assert_eq!(epochs(&replica, 1), [0, 1]);
+    let held: Vec<u32> = replica.lengths().map(|(frame, _)| frame.epoch).collect();
+    assert_eq!(held, [0, 1]);
+    // What begins is taken all the same.
+    feed(&mut replica, &chain(1, 300, 1, 0));
+    let held: Vec<u32> = replica.lengths().map(|(frame, _)| frame.epoch).collect();
+    assert_eq!(held, [1, 300]);
+}
+
+/// A robot that lost its past gives up nothing of it, and may never come back: those that hold parts of it agree.
+#[test]
+fn those_that_heard_of_different_epochs_agree_once_they_met() {
+    let mut replicas = [of_epochs(1), of_epochs(1), of_epochs(1)];
+    for (replica, epoch) in replicas.iter_mut().zip([7, 5, 6]) {
+        feed(replica, &chain(1, epoch, 2, 0));
+    }
+    let [a, b, c] = &mut replicas;
+    while pull(b, a, 65_536) + pull(c, b, 65_536) + pull(a, c, 65_536) > 0 {}
+    assert!(view(a) == view(b) && view(b) == view(c));
+    assert_eq!(epochs(a, 1), [7]);
+    // A fork of the newest is the newest.
+    let [x, y] = [0, 1].map(|story| chain(1, 8, 1, story)[0].clone());
+    a.ingest_fork(&x, &y).unwrap();
+    assert_eq!((epochs(a, 1), a.first_epoch(frame(1, 0).robot)), (vec![8], Some(8)));
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! A tiny shell for tests: agents joined by perfect wires, jobs run inline, a world of random boxes.
 
-use merganser_protocol::agent::io::{Channel, Event, Input, Output, QueryKind, Record};
+use merganser_protocol::agent::io::{Channel, Event, Input, JobId, Output, QueryKind, Record};
 use merganser_protocol::agent::job::{AlignJob, Job, JobResult, Measured, NotAligned};
 use merganser_protocol::agent::{Agent, Identity, Restored};
 use merganser_protocol::config::Config;
@@ -154,6 +154,9 @@ pub struct Wires {
     pub lost: Lost,
     /// What an outsider answers before the one who is asked does.
     pub forged: Forged,
+    /// Kinds of jobs that are not run, and whose they are.
+    pub hold: &'static [&'static str],
+    pub held: Vec<(usize, JobId, Job)>,
     inbox: VecDeque<(usize, Input)>,
 }
 
@@ -171,6 +174,8 @@ impl Wires {
             answers: Box::new(|_| None),
             lost: Box::new(|_, _| false),
             forged: Box::new(|_, _, _| Vec::new()),
+            hold: &[],
+            held: Vec::new(),
             inbox: VecDeque::new(),
         };
         for a in 0..wires.agents.len() {
@@ -255,6 +260,7 @@ impl Wires {
                 }
             }
             Output::Answer { .. } => {}
+            Output::Run { id, job } if self.hold.contains(&job.kind()) => self.held.push((k, id, job)),
             Output::Run { id, job } => {
                 let answer = if let Job::Align(job) = &job { (self.answers)(job) } else { None };
                 let result = answer.map_or_else(|| job.run(), JobResult::Aligned);

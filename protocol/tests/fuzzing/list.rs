@@ -220,11 +220,13 @@ fn the_future_waits_or_is_carried() {
     let newer = EntryContent { kind: 200, payload: vec![1, 2, 3], ..content(2, 2, 0, Hash::default()) };
     victim.keep(sign(2, newer));
     assert_eq!((victim.0.status().entries, victim.refused("unknown_fact")), (1, 1));
-    // The last epoch but one may begin; the last of all, and more epochs than are held, may not.
+    // The last epoch but one may begin; the last of all may not. Of more epochs than are held the oldest goes.
     assert!(!stored(&victim.hear_entry(first(2, u32::MAX))));
     victim.keep(first(2, u32::MAX - 1));
-    assert!(!stored(&victim.hear_entry(first(2, 9))));
-    assert_eq!(victim.refused("epoch_limit"), 2);
+    let oldest = victim.0.heads().map(|(frame, _)| frame).find(|frame| frame.robot == robot(2));
+    [9, 10].map(|epoch| victim.keep(first(2, epoch)));
+    assert!(oldest.is_some() && victim.0.heads().all(|(frame, _)| Some(frame) != oldest));
+    assert_eq!((victim.0.heads().count(), victim.refused("epoch_limit")), (3, 1));
 }
 
 #[test]

@@ -3,7 +3,6 @@
 //! shouts, and the store's file stays within a bound.
 
 use super::{Check, RobotSample, Sample, Seen};
-use merganser_protocol::config::GossipConfig;
 use merganser_protocol::ids::RobotId;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,8 +14,9 @@ const STATS_ROWS_MAX: usize = 128;
 const DISK_BYTES_MAX: u64 = 64 << 20;
 
 /// See the module.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Bounded {
+    epochs_per_robot_max: usize,
     /// Members that ever ran.
     members: BTreeSet<RobotId>,
 }
@@ -39,11 +39,15 @@ impl Check for Bounded {
 }
 
 impl Bounded {
+    /// For robots that hold so many epochs of each.
+    pub fn new(epochs_per_robot_max: usize) -> Self {
+        Self { epochs_per_robot_max, members: BTreeSet::new() }
+    }
+
     fn check(&self, robot: &RobotSample) -> Result<(), String> {
         let mut epochs: BTreeMap<RobotId, usize> = BTreeMap::new();
         robot.logs.keys().for_each(|frame| *epochs.entry(frame.robot).or_default() += 1);
-        let epochs_max = GossipConfig::default().epochs_per_robot_max;
-        if let Some((origin, count)) = epochs.iter().find(|(_, count)| **count > epochs_max) {
+        if let Some((origin, count)) = epochs.iter().find(|(_, count)| **count > self.epochs_per_robot_max) {
             return Err(format!("{count} epochs of {origin}"));
         }
         if robot.disk_bytes > DISK_BYTES_MAX {
@@ -77,7 +81,7 @@ mod tests {
         let mut one = robot("alpha", 1, &[]);
         one.logs.insert(FrameId { robot: id, epoch: 0 }, Some(3));
         spoil(&mut one);
-        let mut check = Bounded::default();
+        let mut check = Bounded::new(3);
         check.see(0, &Seen::Started(id))?;
         check.sample(&sample(vec![one], &BTreeMap::new(), &Expect::default()))
     }
@@ -90,7 +94,7 @@ mod tests {
                 one.logs.extend((0..count).map(|epoch| (FrameId { robot: RobotId([1; 8]), epoch }, Some(1))));
             }
         };
-        assert!(verdict(epochs(64)).is_ok() && verdict(epochs(65)).is_err());
+        assert!(verdict(epochs(3)).is_ok() && verdict(epochs(4)).is_err());
         let disk = |bytes| move |one: &mut RobotSample| one.disk_bytes = bytes;
         assert!(verdict(disk(DISK_BYTES_MAX)).is_ok() && verdict(disk(DISK_BYTES_MAX + 1)).is_err());
         let unsaved = |count| move |one: &mut RobotSample| one.snapshot.as_mut().unwrap().status.unsaved = count;

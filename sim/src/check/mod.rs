@@ -141,16 +141,16 @@ pub struct Violation {
 pub struct Checks(Vec<Box<dyn Check>>);
 
 impl Checks {
-    /// Every invariant there is.
-    pub fn all() -> Self {
+    /// Every invariant there is, for robots that hold so many epochs of each.
+    pub fn all(epochs_per_robot_max: usize) -> Self {
         Self(vec![
             Box::<contract::Contract>::default(),
             Box::<durable_first::DurableFirst>::default(),
             Box::<unique_entries::UniqueEntries>::default(),
-            Box::<never_back::NeverBack>::default(),
+            Box::new(never_back::NeverBack::new(epochs_per_robot_max)),
             Box::<closed::Closed>::default(),
             Box::<floors::Floors>::default(),
-            Box::<bounded::Bounded>::default(),
+            Box::new(bounded::Bounded::new(epochs_per_robot_max)),
             Box::new(same_facts::SameFacts),
             Box::new(same_estimate::SameEstimate),
             Box::new(sound_numbers::SoundNumbers),

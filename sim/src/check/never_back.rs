@@ -2,7 +2,7 @@
 //! robot's disk up to some place is so at every later moment and after every restart, a log in quarantine stays there,
 //! and the robot's own epoch does not fall, nor does it return to one that its disk knows as closed. A disk that was
 //! wiped, or that lost what it had confirmed, is excused, and so are logs that their writer gave up by an entry that is
-//! durable.
+//! durable, and those that are older than as many epochs of their writer as are held.
 
 use super::pending::Pending;
 use super::{Check, RobotSample, Sample, Seen};
@@ -12,8 +12,9 @@ use merganser_protocol::wire::{Entry, Fact};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// See the module.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct NeverBack {
+    epochs_per_robot_max: usize,
     robots: BTreeMap<usize, Held>,
 }
 
@@ -52,6 +53,13 @@ impl Log {
     }
 }
 
+impl NeverBack {
+    /// For robots that hold so many epochs of each.
+    pub fn new(epochs_per_robot_max: usize) -> Self {
+        Self { epochs_per_robot_max, robots: BTreeMap::new() }
+    }
+}
+
 impl Held {
     fn forget(&mut self) {
         self.logs.clear();
@@ -67,8 +75,21 @@ impl Held {
         self.quarantined.retain(|frame, _| stays(frame));
     }
 
-    fn compare(&mut self, robot: &RobotSample) -> Result<(), String> {
+    /// Where as many epochs of a writer are held as may be, older ones need not be.
+    fn crowd_out(&mut self, held: &BTreeMap<FrameId, Option<u32>>, max: usize) {
+        let mut counts = BTreeMap::<RobotId, usize>::new();
+        for frame in held.keys().rev() {
+            let count = counts.entry(frame.robot).or_default();
+            *count += 1;
+            if *count == max {
+                self.retire(frame.robot, frame.epoch);
+            }
+        }
+    }
+
+    fn compare(&mut self, robot: &RobotSample, epochs_max: usize) -> Result<(), String> {
         let name = &robot.name;
+        self.crowd_out(&robot.logs, epochs_max);
         for (frame, log) in &mut self.logs {
             match robot.logs.get(frame) {
                 Some(None) => log.len = 0,
@@ -145,7 +166,11 @@ impl Check for NeverBack {
     }
 
     fn sample(&mut self, sample: &Sample<'_>) -> Result<(), String> {
-        sample.robots.iter().try_for_each(|robot| self.robots.entry(robot.index).or_default().compare(robot))
+        let epochs_max = self.epochs_per_robot_max;
+        sample
+            .robots
+            .iter()
+            .try_for_each(|robot| self.robots.entry(robot.index).or_default().compare(robot, epochs_max))
     }
 }
 
@@ -183,13 +208,13 @@ mod tests {
 
     #[test]
     fn it_bites_on_a_log_that_shrinks_even_across_a_restart() {
-        let mut check = NeverBack::default();
+        let mut check = NeverBack::new(2);
         store(&mut check, 0..3);
         assert!(look(&mut check, Some(3)).is_ok());
         check.see(0, &Seen::Died).unwrap();
         assert!(look(&mut check, Some(4)).is_ok());
         assert!(look(&mut check, Some(3)).is_err());
-        let mut check = NeverBack::default();
+        let mut check = NeverBack::new(2);
         store(&mut check, 0..3);
         assert!(look(&mut check, Some(2)).is_err(), "what the disk confirmed counts, seen or not");
     }
@@ -216,7 +241,7 @@ mod tests {
         for (epoch, below, durable, may) in
             [(9, 9, true, true), (9, 5, true, true), (9, 4, true, false), (9, 9, false, false), (4, 9, true, false)]
         {
-            let mut check = NeverBack::default();
+            let mut check = NeverBack::new(2);
             store(&mut check, 0..3);
             retires(&mut check, epoch, below);
             if durable {
@@ -232,9 +257,21 @@ mod tests {
     }
 
     #[test]
+    fn the_oldest_log_may_go_once_as_many_newer_ones_are_held_and_no_sooner() {
+        for (newer, may) in [(vec![5, 9], true), (vec![9], false), (vec![2, 9], false)] {
+            let mut check = NeverBack::new(2);
+            store(&mut check, 0..3);
+            let mut one = robot("alpha", 1, &[]);
+            one.logs.extend(newer.iter().map(|epoch| (FrameId { epoch: *epoch, ..FRAME }, Some(1))));
+            let gone = check.sample(&sample(vec![one], &BTreeMap::new(), &Expect::default()));
+            assert_eq!(gone.is_ok(), may, "{newer:?}");
+        }
+    }
+
+    #[test]
     fn it_bites_on_a_quarantine_that_is_lifted() {
         for durable in [false, true] {
-            let mut check = NeverBack::default();
+            let mut check = NeverBack::new(2);
             assert!(look(&mut check, Some(3)).is_ok());
             check.see(0, &Seen::Output(&Output::Persist { batch: 1, records: vec![] })).unwrap();
             assert!(look(&mut check, None).is_ok());
@@ -245,7 +282,7 @@ mod tests {
             check.see(0, &Seen::Died).unwrap();
             assert_eq!(look(&mut check, Some(3)).is_err(), durable, "until it is on disk, a proof may die");
         }
-        let mut check = NeverBack::default();
+        let mut check = NeverBack::new(2);
         assert!(look(&mut check, None).is_ok(), "read from the disk");
         assert!(look(&mut check, Some(3)).is_err());
     }
@@ -253,7 +290,7 @@ mod tests {
     #[test]
     fn it_bites_on_an_epoch_that_falls() {
         let (truth, expect) = (BTreeMap::new(), Expect::default());
-        let mut check = NeverBack::default();
+        let mut check = NeverBack::new(2);
         let mut at = |epoch| {
             let mut one = robot("alpha", 1, &[]);
             one.snapshot.as_mut().unwrap().status.epoch = epoch;
@@ -266,7 +303,7 @@ mod tests {
     fn it_bites_on_a_closed_epoch_that_is_taken_up_again_after_a_restart() {
         for durable in [false, true] {
             let (truth, expect) = (BTreeMap::new(), Expect::default());
-            let mut check = NeverBack::default();
+            let mut check = NeverBack::new(2);
             let output = Output::Persist { batch: 1, records: vec![Record::EpochClosed { epoch: 5 }] };
             check.see(0, &Seen::Output(&output)).unwrap();
             if durable {
@@ -286,12 +323,12 @@ mod tests {
     #[test]
     fn a_lost_disk_is_excused_and_entries_beyond_a_hole_are_no_promise() {
         for seen in [Seen::Wiped, Seen::Damaged] {
-            let mut check = NeverBack::default();
+            let mut check = NeverBack::new(2);
             assert!(look(&mut check, Some(3)).is_ok());
             check.see(0, &seen).unwrap();
             assert!(look(&mut check, Some(1)).is_ok());
         }
-        let mut check = NeverBack::default();
+        let mut check = NeverBack::new(2);
         store(&mut check, 5..7);
         assert!(look(&mut check, Some(0)).is_ok());
     }

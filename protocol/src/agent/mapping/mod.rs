@@ -115,6 +115,13 @@ impl Mapping {
         self.queue.len() + usize::from(self.describing.is_some())
     }
 
+    /// The first submap that is not described yet. Lookalikes name submaps of the log that they are stated in, and only
+    /// described ones: none waits that came before.
+    pub(super) fn first_undescribed(&self) -> Option<SubmapId> {
+        let describing = self.describing.map(|(_, id)| id);
+        describing.or_else(|| self.queue.front().map(|(id, _)| *id))
+    }
+
     /// Keyframes taken.
     pub(super) fn keyframes(&self) -> u64 {
         self.keyframes

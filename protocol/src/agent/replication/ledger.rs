@@ -53,8 +53,6 @@ pub(in crate::agent) enum Heard {
     Early(FrameId),
     /// It proves that the log has two histories.
     Forked(FrameId),
-    /// We signed it, and there is no room for its log.
-    Crowded,
     /// Nothing changed.
     Nothing,
 }
@@ -109,11 +107,6 @@ impl Replication {
             }
             Err(error) => {
                 refuse(context, from, &error);
-                // Room is looked for before signatures are, and anyone may send what nobody signed.
-                let is_ours = matches!(error, IngestError::EpochLimit(robot) if robot == context.robot());
-                if is_ours && self.replica.is_signed(bytes) {
-                    return Heard::Crowded;
-                }
                 if let IngestError::TooEarly(id) = error { Heard::Early(id.frame) } else { Heard::Nothing }
             }
         }

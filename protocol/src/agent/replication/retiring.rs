@@ -1,5 +1,6 @@
-//! Epochs that their writers gave up. A robot that begins more epochs than others hold gives up its oldest in the first
-//! entry of the new one, so that the sixty-fifth start of a SLAM is like the second.
+//! Epochs that are gone: the oldest, once a robot has begun more than are held, so that the sixty-fifth start of a SLAM
+//! is like the second; and those that their writer gave up in the first entry of a new one, because its share of the
+//! bytes was full.
 
 use super::Replication;
 use crate::agent::context::Context;
@@ -18,16 +19,11 @@ impl Replication {
 
     /// What must be said again when our log is replaced.
     pub(super) fn retired(&self, robot: RobotId) -> Option<Fact> {
-        let first = NonZero::new(self.replica.first_epoch(robot)?)?;
+        let first = NonZero::new(self.replica.stated_first_epoch(robot)?)?;
         Some(Fact::Retired(RetiredFact { below: first }))
     }
 
-    /// Whether our epoch has entries, and another must begin to make room for what we lost and others hold.
-    pub(in crate::agent) fn is_begun(&self, context: &Context) -> bool {
-        self.replica.next_seq(context.frame()) > 0
-    }
-
-    /// Takes logs off the disk that were given up, and tells of it. Our own submaps that are gone; `None` if no log is.
+    /// Takes logs off the disk that were given up or too many, and tells of it. Our own submaps that are gone; `None` if no log is.
     /// `private` are own submaps that the disk holds something of, beside those that are known.
     pub(in crate::agent) fn drop_retired(
         &mut self,
