@@ -1,7 +1,7 @@
 //! The command line. Exit codes: 0, all went well; 1, it did not (a check failed, the agent could not go on); 2, the
 //! command line, the configuration or a file that was given is wrong.
 
-use crate::commands::{BadInput, align, check, graph, keys, replay, run, store, watch};
+use crate::commands::{BadInput, align, check, doctor, graph, keys, replay, run, store, watch};
 use crate::config::FileConfigError;
 use crate::demo::{self, DemoArgs};
 use crate::host::HostError;
@@ -37,6 +37,8 @@ pub enum Command {
     Run(run::RunArgs),
     /// Align two clouds or submaps, or tell why they do not align.
     Align(align::AlignArgs),
+    /// Look at what a SLAM sends, or at a recording: what is seen, and what to change.
+    Doctor(doctor::DoctorArgs),
     /// Watch a swarm: a live table, or every message as a line of JSON.
     Watch(watch::WatchArgs),
     /// Check a configuration and print what it means.
@@ -79,6 +81,7 @@ fn dispatch(command: Command) -> Result<bool> {
         Command::Demo(args) => demo::run(args),
         Command::Run(args) => run::run(&args),
         Command::Align(args) => align::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Watch(args) => watch::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Keys(command) => keys::run(command),

@@ -330,7 +330,7 @@ fn tell(event: &Event) {
              kind are counted in view/status",
             why.text()
         ),
-        Event::OdometryOdd { frame, oddity } => warn!(%frame, "{oddity}"),
+        Event::InputOdd { frame, oddity } => warn!(%frame, "{oddity}"),
         Event::SubmapFinished { submap, keypoints } => info!(%submap, keypoints, "submap finished"),
         Event::AlignmentAgreed { i, j } => info!(%i, %j, "alignment agreed"),
         Event::AlignmentDisputed { i, j } => warn!(%i, %j, "alignment disputed"),

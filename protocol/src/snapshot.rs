@@ -89,6 +89,9 @@ pub struct StatusView {
     /// Motions across lost keyframes: known to `submap.gap_sigma_per_m` only.
     #[serde(default)]
     pub gaps: u64,
+    /// What is odd about what the front end sends, in this epoch, and what to do about it.
+    #[serde(default)]
+    pub remarks: Vec<String>,
     /// Pairs of submaps still to be tried by this robot, jobs running, records not yet durable.
     pub pending: u64,
     /// Of these, what a restart would lose: submaps not yet stated, records not yet durable.

@@ -2,6 +2,7 @@
 
 pub mod align;
 pub mod check;
+pub mod doctor;
 pub mod graph;
 pub mod keys;
 pub mod replay;

@@ -108,6 +108,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
             keyframes: KEYFRAMES as u64,
             keyframes_lost: BTreeMap::new(),
             gaps: 0,
+            remarks: Vec::new(),
             pending: 0,
             idle: true,
             merged_with: others(own),

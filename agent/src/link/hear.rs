@@ -92,22 +92,40 @@ fn question(shared: &Shared, tokens: &AtomicU64, kind: QueryKind, query: Query) 
 }
 
 fn own(shared: &Shared, input: &'static str, sample: &Sample) {
+    match parse(input, sample, shared.input_bytes_max) {
+        Ok(observed) => {
+            shared.inbox.offer(Source::Own, observed);
+        }
+        Err(Unfit { loss, kind, reason }) => {
+            lose(shared, input, loss);
+            refuse(shared, input, &kind, &reason);
+        }
+    }
+}
+
+/// Why what came for an input is none.
+pub(super) struct Unfit {
+    loss: Loss,
+    /// To count by.
+    kind: String,
+    pub(super) reason: String,
+}
+
+/// Reads what came for an input.
+pub(super) fn parse(input: &str, sample: &Sample, bytes_max: usize) -> Result<Input, Unfit> {
     let Some(format) = format_of(sample.encoding()) else {
-        lose(shared, input, Loss::Unreadable);
         let (stated, cure) = (sample.encoding(), "state application/json, or application/octet-stream for postcard");
-        return refuse(
-            shared,
-            input,
-            "neither application/json nor octet-stream",
-            &format!("the encoding {stated} is not read; {cure}"),
-        );
+        return Err(Unfit {
+            loss: Loss::Unreadable,
+            kind: "neither application/json nor octet-stream".into(),
+            reason: format!("the encoding {stated} is not read; {cure}"),
+        });
     };
-    let (length, limit) = (sample.payload().len(), shared.input_bytes_max);
-    if length > limit {
-        let reason =
-            format!("larger than zenoh.input_bytes_max = {limit}: raise it (to 16777216 at most) or thin the data");
-        lose(shared, input, Loss::TooLarge);
-        return refuse(shared, input, &reason, &format!("{length} bytes, {reason}"));
+    let length = sample.payload().len();
+    if length > bytes_max {
+        let kind =
+            format!("larger than zenoh.input_bytes_max = {bytes_max}: raise it (to 16777216 at most) or thin the data");
+        return Err(Unfit { loss: Loss::TooLarge, reason: format!("{length} bytes, {kind}"), kind });
     }
     let bytes = sample.payload().to_bytes();
     let parsed = match input {
@@ -115,16 +133,10 @@ fn own(shared: &Shared, input: &'static str, sample: &Sample) {
         "sighting" => observation::sighting(format, &bytes).map(Input::Sighting),
         _ => observation::position(format, &bytes).map(Input::Position),
     };
-    match parsed {
-        Ok(observed) => {
-            shared.inbox.offer(Source::Own, observed);
-        }
-        Err(reason) => {
-            lose(shared, input, Loss::Unreadable);
-            let reason = reason.to_string();
-            refuse(shared, input, first_words(&reason), &reason);
-        }
-    }
+    parsed.map_err(|error| {
+        let reason = error.to_string();
+        Unfit { loss: Loss::Unreadable, kind: first_words(&reason).into(), reason }
+    })
 }
 
 /// Refuses input that came by the session of the robots, where anyone may have sent it. It leaves no gap in the odometry:

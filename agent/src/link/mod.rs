@@ -5,6 +5,7 @@
 mod allowance;
 mod door;
 mod hear;
+pub mod overhear;
 mod say;
 pub mod scouting;
 pub mod session;

@@ -417,8 +417,8 @@ pub enum Event {
         /// What lost them.
         why: Loss,
     },
-    /// What our front end states of its own errors is odd. Each kind is told once in an epoch.
-    OdometryOdd {
+    /// What our front end sends is odd. Each kind is told once in an epoch.
+    InputOdd {
         /// Our frame.
         frame: FrameId,
         /// In what way.

@@ -44,7 +44,7 @@ pub use alignment::{
     REFUSED_MAX, REFUSED_WAITING_MAX, SECOND_LOOKS_MAX, TRIES_PER_SUBMAP,
 };
 pub use estimation::{ROBOTS_ALL_PAIRS_MAX, estimate_version};
-pub use mapping::{CLOCK_BACK_KEYFRAMES, PATH_KEYFRAMES_MAX, SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX};
+pub use mapping::{CLOCK_BACK_KEYFRAMES, PATH_KEYFRAMES_MAX, SIGHTING_AGE_SECS_MAX, TURN_SIGMA_MAX, stated};
 pub use replication::knowledge::Agreement;
 pub use replication::{BLOBS_MAX, GONE_IN_A_ROW_MAX, PROOFS_PER_SEC, UNSENT_MAX};
 

@@ -130,7 +130,7 @@ impl Agent {
 
     /// A submap was described: it is stated, and what belongs to it kept.
     fn on_described(&mut self, job: JobId, described: (Submap, Described)) {
-        let Some(finished) = self.mapping.on_described(&self.context, job, described) else { return };
+        let Some(finished) = self.mapping.on_described(&mut self.context, job, described) else { return };
         let Finished { id, fact, blob: (hash, bytes), described } = finished;
         if !self.write(id.frame.epoch, &fact) {
             return;

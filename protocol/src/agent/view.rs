@@ -58,6 +58,7 @@ impl Agent {
             keyframes: self.mapping.keyframes(),
             keyframes_lost: self.mapping.losses().keyframes(),
             gaps: self.mapping.losses().gaps(),
+            remarks: self.mapping.remarks(),
             pending,
             unsaved: self.unsaved(),
             idle: pending == 0 && settled,

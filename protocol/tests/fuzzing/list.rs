@@ -224,7 +224,8 @@ fn the_future_waits_or_is_carried() {
     assert!(!stored(&victim.hear_entry(first(2, u32::MAX))));
     victim.keep(first(2, u32::MAX - 1));
     let oldest = victim.0.heads().map(|(frame, _)| frame).find(|frame| frame.robot == robot(2));
-    [9, 10].map(|epoch| victim.keep(first(2, epoch)));
+    victim.keep(first(2, 9));
+    victim.keep(first(2, 10));
     assert!(oldest.is_some() && victim.0.heads().all(|(frame, _)| Some(frame) != oldest));
     assert_eq!((victim.0.heads().count(), victim.refused("epoch_limit")), (3, 1));
 }

@@ -209,6 +209,7 @@ pub(crate) mod tests {
             keyframes: 1,
             keyframes_lost: BTreeMap::new(),
             gaps: 0,
+            remarks: Vec::new(),
             pending: 0,
             idle: true,
             merged_with: frames.iter().filter_map(|(f, _)| f.split('/').next().map(str::to_owned)).collect(),

@@ -47,7 +47,7 @@ fn copy(from: &Path, to: &Path) {
 
 fn oddities(wires: &Wires) -> Vec<(usize, String)> {
     let odd = wires.events.iter().filter_map(|(robot, event)| match event {
-        Event::OdometryOdd { oddity: Oddity::Unmeasured(axes) | Oddity::Blurs(axes), .. } => {
+        Event::InputOdd { oddity: Oddity::Unmeasured(axes) | Oddity::Blurs(axes), .. } => {
             Some((*robot, axes.to_string()))
         }
         _ => None,

@@ -20,6 +20,7 @@ use super::odometry::{across_gap_after, isotropic, motion, motion_across};
 use super::open::{Open, moved};
 use super::place::{Place, PlaceMean};
 use super::planar::{Sharpener, TILT_MAX, flat, flat_motion};
+use super::reading::Readings;
 use super::rest::{NOISE_MAX, Rest, is_blurred, is_near};
 use super::runs::Runs;
 use super::stated::{Oddities, Oddity, is_constant};
@@ -93,6 +94,7 @@ pub struct SubmapBuilder {
     sharpener: Sharpener,
     misfits: Misfits,
     misfit: Option<f64>,
+    readings: Readings,
     oddities: Oddities,
 }
 
@@ -116,6 +118,7 @@ impl SubmapBuilder {
             sharpener: Sharpener::default(),
             misfits: Misfits::default(),
             misfit: None,
+            readings: Readings::default(),
             oddities: Oddities::default(),
         }
     }
@@ -146,7 +149,13 @@ impl SubmapBuilder {
     /// # Errors
     /// [`KeyframeError`] if the keyframe is refused.
     pub fn push(&mut self, keyframe: Keyframe) -> Result<Option<Submap>, KeyframeError> {
-        if let Err(error) = self.check(&keyframe) {
+        let checked = self.check(&keyframe);
+        // One that is too far away is looked at, too: its unit may be the reason.
+        if matches!(checked, Ok(()) | Err(KeyframeError::Jump { .. })) {
+            let odd = self.readings.look(&keyframe, &self.config);
+            odd.into_iter().for_each(|oddity| self.oddities.tell(oddity));
+        }
+        if let Err(error) = checked {
             self.loss(keyframe.stamp, &error).into_iter().for_each(|why| self.lose(why));
             if matches!(error, KeyframeError::Jump { .. }) {
                 self.continuity.refuse(&keyframe, &self.config);
@@ -253,7 +262,7 @@ impl SubmapBuilder {
         self.misfit.take()
     }
 
-    /// What is odd about the covariances that the front end states: each kind once.
+    /// What is odd about what the front end sends: each kind once.
     pub fn take_oddities(&mut self) -> Vec<Oddity> {
         self.oddities.take()
     }

@@ -36,7 +36,10 @@ pub enum KeyframeError {
     #[error("keyframe position is not finite or beyond {POSITION_MAX} from the origin; use a local frame")]
     BadPosition,
     /// A planar robot's body is tilted.
-    #[error("the body is tilted by {tilt:.2} rad, more than {TILT_MAX}; is this a planar robot? See submap.sensor")]
+    #[error(
+        "the body is tilted by {tilt:.2} rad, more than {TILT_MAX}; is this a planar robot (see \
+             submap.sensor), and its quaternion [x, y, z, w]?"
+    )]
     NotPlanar {
         /// Angle between the body's and the frame's upward axis, rad.
         tilt: f64,

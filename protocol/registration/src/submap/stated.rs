@@ -10,6 +10,7 @@
 //! A pose covariance that is the same at two poses is no chain's, whose errors add up: its driver states a constant. The
 //! motion then counts as known to `gap_sigma_per_m` as well.
 
+use super::reading::Reading;
 use super::{CovarianceOf, Keyframe};
 use crate::config::SubmapConfig;
 use crate::geometry::Covariance;
@@ -95,7 +96,7 @@ pub(super) fn is_constant(last: &Keyframe, next: &Keyframe, config: &SubmapConfi
     is_of_poses && moved && (0..6).all(|r| (0..=r).all(|c| (a[(r, c)] - b[(r, c)]).abs() <= SAME * scale(r, c)))
 }
 
-/// What is odd about the covariances that a front end states.
+/// What is odd about what a front end sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
 pub enum Oddity {
     /// These axes are not measured.
@@ -104,6 +105,33 @@ pub enum Oddity {
     Constant,
     /// Each keyframe ends a submap, because these axes are less certain than `sigma_max_m` or `sigma_max_deg`.
     Blurs(Axes),
+    /// Views lie over one another if poses and points are read in another way than they are.
+    Read {
+        /// In which.
+        reading: Reading,
+        /// Pairs of views that say so, of so many that tell the two apart.
+        pairs: [u32; 2],
+    },
+    /// Points lie farther off than any sensor sees.
+    Reach {
+        /// In the median.
+        metres: u32,
+    },
+    /// Keyframes lie so far apart that no two see the same.
+    StepsApart {
+        /// The steps, and how far points lie off, in the median, hundredths of a frame unit.
+        centimetres: [u32; 2],
+    },
+    /// Stamps are not in nanoseconds: by so much they rise too slowly.
+    Stamps {
+        /// As a power of ten.
+        power: u32,
+    },
+    /// Submaps have hardly any keypoints.
+    Bare {
+        /// The median.
+        keypoints: u32,
+    },
 }
 
 impl fmt::Display for Oddity {
@@ -123,6 +151,36 @@ impl fmt::Display for Oddity {
                 "the stated covariances are too large in {axes} for views to be laid over one another: each keyframe is a \
                  submap of its own, and hardly any will merge; state what the odometry really errs by from keyframe to \
                  keyframe, or raise submap.sigma_max_m and submap.sigma_max_deg"
+            ),
+            Self::Read { reading, pairs: [wins, pairs] } => {
+                write!(f, "views lie over one another ({wins} pairs of {pairs}) if {reading}")
+            }
+            Self::Reach { metres } => write!(
+                f,
+                "points lie {metres} m off in the median, farther than any sensor sees: most likely they are in millimetres; \
+                 send metres, or state submap.scale = \"unknown\""
+            ),
+            Self::StepsApart { centimetres } => {
+                let [step, reach] = centimetres.map(|c| f64::from(c) / 100.0);
+                write!(
+                    f,
+                    "keyframes lie {step} m apart, and points only {reach} m off, so that no two views overlap: send \
+                     keyframes more often, or, if poses are in millimetres, metres"
+                )
+            }
+            Self::Stamps { power } => {
+                let unit = match power {
+                    9 => "seconds",
+                    6 => "milliseconds",
+                    _ => "microseconds",
+                };
+                write!(f, "stamps rise as if they were in {unit}: send nanoseconds (times 10^{power})")
+            }
+            Self::Bare { keypoints } => write!(
+                f,
+                "submaps have {keypoints} keypoints in the median, too few to be recognised: points are too sparse for \
+                 submap.voxel_m, or see little beyond one plane; try a voxel of a hundredth of how far they reach, a longer \
+                 submap.distance_m, or the right submap.sensor"
             ),
         }
     }
@@ -156,7 +214,8 @@ impl Oddities {
         }
     }
 
-    fn tell(&mut self, oddity: Oddity) {
+    /// Keeps what is to be told, unless one of its kind was.
+    pub fn tell(&mut self, oddity: Oddity) {
         let kind = core::mem::discriminant(&oddity);
         if !self.told.iter().any(|told| core::mem::discriminant(told) == kind) {
             self.told.push(oddity);

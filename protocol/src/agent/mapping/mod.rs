@@ -17,9 +17,12 @@ use super::replication::knowledge::Knowledge;
 use crate::config::SubmapConfig;
 use crate::geometry::{PoseWithCovariance, Se3};
 use crate::ids::{Hash, SubmapId};
+use crate::kinds::ScaleKind;
 use crate::snapshot::PathView;
 use crate::submap::continuity::FrameSign;
+use crate::submap::habits::Habits;
 use crate::submap::runs::Runs;
+use crate::submap::stated::Oddity;
 use crate::submap::{Described, Keyframe, KeyframeError, Loss, Submap, SubmapBuilder};
 use crate::time::{Instant, Stamp};
 use crate::wire::fact::{Fact, SubmapFact};
@@ -48,6 +51,7 @@ pub(super) struct Mapping {
     describing: Option<(JobId, SubmapId)>,
     keyframes: u64,
     losses: Losses,
+    habits: Habits,
     path: Path,
     positions: Positions,
 }
@@ -60,6 +64,24 @@ pub(super) struct Finished {
     /// Its keypoints as they are sent, and their address.
     pub(super) blob: (Hash, Vec<u8>),
     pub(super) described: Described,
+}
+
+/// What a robot states of a submap, and its keypoints as they are sent, with their address.
+pub fn stated(submap: &Submap, described: &Described, scale: ScaleKind) -> (Fact, (Hash, Vec<u8>)) {
+    let blob = described.keypoints.encode();
+    let hash = Hash::of(&blob);
+    let fact = Fact::Submap(SubmapFact {
+        index: submap.index,
+        stamps: submap.stamps,
+        odometry: submap.odometry,
+        extent: described.extent,
+        summary: described.summary.encode(),
+        keypoint_count: u16::try_from(described.keypoints.len()).unwrap_or(u16::MAX),
+        blob: hash,
+        scale,
+        keyframes: u16::try_from(submap.keyframes.len()).ok().and_then(NonZero::new),
+    });
+    (fact, (hash, blob))
 }
 
 /// Keyframes in a row that were refused because their stamps, which rise, are behind the last one taken.
@@ -82,6 +104,7 @@ impl Mapping {
             describing: None,
             keyframes: 0,
             losses: Losses::default(),
+            habits: Habits::default(),
             path: Path::default(),
             positions: Positions::default(),
         }
@@ -93,6 +116,7 @@ impl Mapping {
         self.behind = None;
         (self.last, self.twist) = (None, None);
         self.path = Path::default();
+        self.habits = Habits::default();
     }
 
     fn taken(&mut self, pose: &Se3, stamp: Stamp) {
@@ -177,12 +201,14 @@ impl Mapping {
     pub(super) fn on_keyframe(&mut self, context: &mut Context, keyframe: Keyframe) -> Option<EpochReason> {
         let (stamp, pose) = (keyframe.stamp, keyframe.pose.pose);
         let session = self.builder.runs().now();
-        match self.builder.push(keyframe) {
+        let pushed = self.builder.push(keyframe);
+        let paced = pushed.as_ref().ok().and_then(|_| self.habits.take(context.now(), stamp));
+        for oddity in self.builder.take_oddities().into_iter().chain(paced) {
+            self.tell(context, oddity);
+        }
+        match pushed {
             Ok(closed) => {
                 self.behind = None;
-                for oddity in self.builder.take_oddities() {
-                    context.event(Event::OdometryOdd { frame: context.frame(), oddity });
-                }
                 let gap = self.builder.take_gap();
                 gap.into_iter().for_each(|why| self.losses.cross(context, why));
                 if !self.builder.has_stood() {
@@ -201,6 +227,17 @@ impl Mapping {
                 (is_behind && self.is_clock_back(context.now(), stamp)).then_some(EpochReason::ClockBack)
             }
         }
+    }
+
+    /// Something is odd about what the front end sends: people are told, now and in `view/status`.
+    fn tell(&mut self, context: &mut Context, oddity: Oddity) {
+        self.habits.keep(oddity);
+        context.event(Event::InputOdd { frame: context.frame(), oddity });
+    }
+
+    /// What is odd about what the front end sends, in this epoch.
+    pub(super) fn remarks(&self) -> Vec<String> {
+        self.habits.found().map(ToString::to_string).collect()
     }
 
     /// Once it is known what the front end calls its run, that is kept for the next start: together with the first
@@ -246,26 +283,20 @@ impl Mapping {
     /// A submap was described: what is to be stated of it, and kept.
     pub(super) fn on_described(
         &mut self,
-        context: &Context,
+        context: &mut Context,
         job: JobId,
         (submap, described): (Submap, Described),
     ) -> Option<Finished> {
         let (_, id) = self.describing.take_if(|(running, _)| *running == job)?;
-        let blob = described.keypoints.encode();
-        let hash = Hash::of(&blob);
+        if id.frame == context.frame()
+            && !context.config().submap.sensor.sees_landmarks()
+            && let Some(bare) = self.habits.described(described.keypoints.len())
+        {
+            self.tell(context, bare);
+        }
         // The epoch may have ended meanwhile: the submap still belongs to the frame it was driven in.
-        let fact = Fact::Submap(SubmapFact {
-            index: submap.index,
-            stamps: submap.stamps,
-            odometry: submap.odometry,
-            extent: described.extent,
-            summary: described.summary.encode(),
-            keypoint_count: u16::try_from(described.keypoints.len()).unwrap_or(u16::MAX),
-            blob: hash,
-            scale: context.config().submap.scale,
-            keyframes: u16::try_from(submap.keyframes.len()).ok().and_then(NonZero::new),
-        });
-        Some(Finished { id, fact, blob: (hash, blob), described })
+        let (fact, blob) = stated(&submap, &described, context.config().submap.scale);
+        Some(Finished { id, fact, blob, described })
     }
 
     /// After a restart: the trajectory goes on from the last submap that is durable, if the front end's run does.

@@ -1,0 +1,79 @@
+//! What a robot's own SLAM sends, listened to where its agent would: for whoever wants to look at it before the agent runs.
+
+use super::door::Door;
+use super::hear::parse;
+use super::refused;
+use super::session::{self, LinkError, Role};
+use crate::config::FileConfig;
+use crate::keys;
+use merganser_protocol::agent::io::Input;
+use merganser_protocol::submap::Keyframe;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use zenoh::sample::Sample;
+
+/// Keyframes that are kept at most, and their points.
+const KEYFRAMES_MAX: usize = 4_096;
+const POINTS_MAX: usize = 20_000_000;
+/// How long a session may take to close.
+const CLOSE_WAIT: Duration = Duration::from_secs(2);
+
+/// What came.
+#[derive(Debug, Default)]
+pub struct Overheard {
+    /// Keyframes, and when each came.
+    pub keyframes: Vec<(Instant, Keyframe)>,
+    /// Why other messages could not be read, and how many.
+    pub refused: BTreeMap<String, u64>,
+    points: usize,
+}
+
+impl Overheard {
+    fn take(&mut self, read: Result<Input, String>) {
+        match read {
+            Ok(Input::Keyframe(keyframe)) => {
+                self.points += keyframe.points.len();
+                if self.keyframes.len() < KEYFRAMES_MAX && self.points < POINTS_MAX {
+                    self.keyframes.push((Instant::now(), keyframe));
+                }
+            }
+            Ok(_) => {}
+            Err(reason) => {
+                let kinds = self.refused.len();
+                if kinds < 16 || self.refused.contains_key(&reason) {
+                    *self.refused.entry(reason).or_default() += 1;
+                }
+            }
+        }
+    }
+}
+
+/// Listens for so long; `told` learns where.
+///
+/// # Errors
+/// [`LinkError`] if the agent, or another program, has the endpoint.
+pub async fn overhear(
+    config: &FileConfig,
+    duration: Duration,
+    told: impl FnOnce(&[String]),
+) -> Result<Overheard, LinkError> {
+    let door = Door::open(config).await?;
+    let session = match &door.session {
+        Some(session) => session.clone(),
+        None => session::open(&config.zenoh, Role::Robot).await?,
+    };
+    let heard = Arc::new(Mutex::new(Overheard::default()));
+    let key = keys::of(&config.swarm, &config.robot, "in/keyframe");
+    let (into, limit) = (heard.clone(), config.zenoh.input_bytes_max);
+    let hear = move |sample: Sample| {
+        let read = parse("keyframe", &sample, limit).map_err(|unfit| unfit.reason);
+        into.lock().unwrap_or_else(PoisonError::into_inner).take(read);
+    };
+    session.declare_subscriber(key.clone()).callback(hear).background().await.map_err(refused(key))?;
+    told(&door.endpoints);
+    tokio::time::sleep(duration).await;
+    session::close(&session, CLOSE_WAIT).await;
+    let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+    Ok(core::mem::take(&mut *heard))
+}

@@ -1,0 +1,144 @@
+//! Each reading is found in views of a room, and none where poses and points are as they are to be.
+
+use super::super::testing::{config, keyframe, room_points};
+use super::*;
+use crate::config::Sensor;
+
+/// Drives through a room, turning; what is sent of each place.
+fn drive(count: u32, send: impl Fn(Se3, Vec<Vector3<f64>>) -> (Se3, Vec<Vector3<f64>>)) -> Vec<Keyframe> {
+    let room = room_points(3);
+    let place = |k: u32| {
+        let a = f64::from(k) * 0.13;
+        let turn = So3::exp(&Vector3::new(0.1 * (3.0 * a).sin(), 0.15 * (2.0 * a).cos(), a));
+        Se3::new(turn, Vector3::new(1.2 * a.sin(), 1.0 - a.cos(), 0.2 * (2.0 * a).sin()))
+    };
+    let sent = |k: u32| {
+        let t_room_body = place(0).inverse() * place(k);
+        let seen: Vec<Vector3<f64>> = room.iter().map(|p| place(k).inverse() * *p).collect();
+        let (pose, points) = send(t_room_body, seen);
+        keyframe(i64::from(k) * 500_000_000 + 1, pose, &points)
+    };
+    (0..count).map(sent).collect()
+}
+
+fn found(keyframes: &[Keyframe], config: &SubmapConfig) -> Vec<Oddity> {
+    let mut readings = Readings::default();
+    keyframes.iter().flat_map(|keyframe| readings.look(keyframe, config)).collect()
+}
+
+fn reading(keyframes: &[Keyframe]) -> Option<Reading> {
+    match found(keyframes, &config())[..] {
+        [Oddity::Read { reading, .. }] => Some(reading),
+        [] => None,
+        ref other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn what_is_sent_as_it_is_to_be_is_not_remarked() {
+    assert_eq!(reading(&drive(120, |pose, points| (pose, points))), None);
+    // A poor odometry lays views badly over one another, and so does any other reading.
+    let mut drifting = drive(120, |pose, points| (pose, points));
+    for (k, keyframe) in drifting.iter_mut().enumerate() {
+        let off = Vector3::new(0.004, -0.003, 0.01) * k as f64;
+        keyframe.pose.pose = keyframe.pose.pose * Se3::new(So3::exp(&off), off);
+    }
+    assert_eq!(reading(&drifting), None);
+}
+
+#[test]
+fn each_reading_is_told_from_all_others() {
+    let axes = |axes: [i8; 3]| {
+        move |pose: Se3, points: Vec<Vector3<f64>>| {
+            let r_points_body = matrix(axes).transpose();
+            (pose, points.into_iter().map(|p| r_points_body * p).collect())
+        }
+    };
+    assert_eq!(
+        reading(&drive(80, |pose, points| (pose, points.iter().map(|p| pose * *p).collect()))),
+        Some(Reading::InFrame)
+    );
+    assert_eq!(reading(&drive(80, |pose, points| (pose.inverse(), points))), Some(Reading::Inverse));
+    let w_first = |pose: Se3, points| {
+        let [x, y, z, w] = pose.rotation.xyzw();
+        (Se3::new(So3::from_xyzw([w, x, y, z]).unwrap(), pose.translation), points)
+    };
+    assert_eq!(reading(&drive(80, w_first)), Some(Reading::WFirst));
+    for known in [OPTICAL, Y_UP, MIRRORED, [-1, -2, 3], [2, -1, 3], [1, 3, -2]] {
+        assert_eq!(reading(&drive(80, axes(known))), Some(Reading::Axes(known)), "{known:?}");
+    }
+    // Points too far off for what they are taken for, as well.
+    let milli = drive(80, |pose, points| (pose, points.iter().map(|p| p * 1000.0).collect()));
+    let odd = found(&milli, &config());
+    assert!(
+        matches!(
+            odd[..],
+            [Oddity::Reach { metres: 1000.. }, Oddity::Read { reading: Reading::PointsInMillimetres, .. }]
+        ),
+        "{odd:?}"
+    );
+}
+
+#[test]
+fn upside_down_and_moved_sensors_are_no_other_reading() {
+    let mount = Se3::new(So3::exp(&Vector3::new(std::f64::consts::PI, 0.0, 0.0)), Vector3::new(0.0, 0.0, 0.4));
+    let hung = |pose: Se3, points: Vec<Vector3<f64>>| {
+        (mount.inverse() * pose * mount, points.iter().map(|p| mount.inverse() * *p).collect())
+    };
+    assert_eq!(reading(&drive(80, hung)), None);
+}
+
+#[test]
+fn in_a_plane_there_are_fewer_readings() {
+    let planar = SubmapConfig { sensor: Sensor::Laser2d, ..config() };
+    let all = Reading::all(true);
+    assert!(all.contains(&Reading::Axes(MIRRORED)) && !all.contains(&Reading::Axes(OPTICAL)), "{all:?}");
+    assert_eq!((all.len(), Reading::all(false).len()), (3 + 7, 4 + 47));
+    let sent = |send: fn(Vector3<f64>) -> Vector3<f64>| {
+        let keyframes = (0..80_i64).map(|k| {
+            let a = k as f64 * 0.13;
+            let pose = Se3::new(So3::exp(&Vector3::new(0.0, 0.0, a)), Vector3::new(1.2 * a.sin(), 1.0 - a.cos(), 0.0));
+            let slice = room_points(3).into_iter().filter(|p| p.z.abs() < 0.1);
+            let seen: Vec<Vector3<f64>> =
+                slice.map(|p| pose.inverse() * Vector3::new(p.x, p.y, 0.0)).map(send).collect();
+            keyframe(k * 500_000_000 + 1, pose, &seen)
+        });
+        found(&keyframes.collect::<Vec<_>>(), &planar)
+    };
+    assert_eq!(sent(|p| p), []);
+    let odd = sent(|p| Vector3::new(p.x, -p.y, 0.0));
+    assert!(matches!(odd[..], [Oddity::Read { reading: Reading::Axes(MIRRORED), .. }]), "{odd:?}");
+    let odd = sent(|p| Vector3::new(-p.x, -p.y, 0.0));
+    assert!(matches!(odd[..], [Oddity::Read { reading: Reading::Axes([-1, -2, 3]), .. }]), "{odd:?}");
+}
+
+#[test]
+fn units_that_no_sensor_and_no_robot_has_are_told() {
+    let both = |by: [f64; 2]| {
+        let odd = found(
+            &drive(80, |pose, points| {
+                (Se3::new(pose.rotation, pose.translation * by[0]), points.iter().map(|p| p * by[1]).collect())
+            }),
+            &config(),
+        );
+        odd.into_iter().map(|oddity| core::mem::discriminant(&oddity)).collect::<Vec<_>>()
+    };
+    let kind = |oddity: Oddity| core::mem::discriminant(&oddity);
+    assert_eq!(both([1000.0, 1000.0]), [kind(Oddity::Reach { metres: 0 })]);
+    assert_eq!(both([1000.0, 1.0]), [kind(Oddity::StepsApart { centimetres: [0; 2] })]);
+    assert_eq!(both([1.0, 1.0]), []);
+    // Where the scale is unknown, no unit is wrong.
+    let unknown = SubmapConfig { scale: ScaleKind::Unknown, ..config() };
+    let large = drive(20, |pose, points| {
+        (Se3::new(pose.rotation, pose.translation * 1e3), points.iter().map(|p| p * 1e3).collect())
+    });
+    assert_eq!(found(&large, &unknown), []);
+}
+
+#[test]
+fn few_points_and_a_body_that_stands_say_nothing() {
+    let few = drive(80, |pose, points| (pose.inverse(), points.into_iter().take(PROBES_MIN - 1).collect()));
+    assert_eq!(found(&few, &config()), []);
+    let standing = drive(80, |_, points| (Se3::identity(), points));
+    assert_eq!(reading(&standing[..1].iter().cycle().take(50).cloned().collect::<Vec<_>>()), None);
+}
