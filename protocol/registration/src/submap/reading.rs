@@ -6,7 +6,8 @@
 //! lays points on points, a wrong one does not, as soon as the two motions differ by more than points are apart.
 //! Points that both readings lay on others, as on the ground, say nothing and are left out (as in McNemar's test): a
 //! reading wins a pair if it alone explains a tenth of the points, and three times as many as what was stated alone does.
-//! It is told when it won [`WINS_MIN`] pairs, and three of four of those that could tell the two apart. Where the
+//! It is told when it won [`WINS_MIN`] pairs, three of four of those that could tell the two apart, and three more
+//! than any other. Where the
 //! odometry is poor, or a corridor looks the same everywhere, the stated motion explains as much as any other, and
 //! nothing is told. All lengths are shares of how far the points reach, so that no unit is taken for granted.
 
@@ -42,8 +43,13 @@ const ALONE_RATIO: usize = 3;
 /// Pairs that a reading must win, and their share of those that tell it from what was stated.
 pub const WINS_MIN: u32 = 6;
 const WINS_SHARE: f64 = 0.75;
+/// It leads others by so many pairs, or has had so many that the others are as good as the same.
+const LEAD_MIN: u32 = 3;
+const PAIRS_OF_RIVALS: u32 = 16;
 /// After so many pairs that nothing was found in, no more is looked for: a front end does not change its mind.
 pub const PAIRS_MAX: u32 = 32;
+/// The same of views, where hardly any two overlap.
+const VIEWS_MAX: u32 = 256;
 /// A view that nothing came near of in so many keyframes is replaced.
 const AGE_MAX: u32 = 100;
 
@@ -198,6 +204,7 @@ pub struct Readings {
     view: Option<View>,
     tallies: Vec<Tally>,
     pairs: u32,
+    views: u32,
     is_over: bool,
     last: Option<(Stamp, Se3)>,
     reaches: Vec<f64>,
@@ -221,21 +228,23 @@ impl Readings {
 
     /// Whether points or steps are of another size than any sensor's or robot's.
     fn size(&mut self, pose: &Se3, reach: f64, config: &SubmapConfig) -> Option<Oddity> {
-        if self.reaches.len() >= WINDOW {
-            return None;
+        let counts = |values: &[f64]| values.len() == WINDOW;
+        let was_known = [&self.reaches, &self.steps].map(|values| counts(values));
+        if !was_known[0] {
+            self.reaches.push(reach);
         }
-        self.reaches.push(reach);
+        // A body that stands takes no steps.
         let step = self.last.map(|(_, last)| (pose.translation - last.translation).norm());
-        self.steps.extend(step);
-        if self.reaches.len() < WINDOW {
-            return None;
+        if !was_known[1] {
+            self.steps.extend(step.filter(|step| *step > CELL * reach));
         }
-        let (reach, step) = (median(&mut self.reaches)?, median(&mut self.steps)?);
-        if config.scale == ScaleKind::Metric && reach > REACH_MAX_M {
+        let reach = median(&mut self.reaches)?;
+        if !was_known[0] && counts(&self.reaches) && config.scale == ScaleKind::Metric && reach > REACH_MAX_M {
             return Some(Oddity::Reach { metres: reach as u32 });
         }
-        (step > STEP_MAX * reach)
-            .then_some(Oddity::StepsApart { centimetres: [step, reach].map(|m| (100.0 * m) as u32) })
+        let step = median(&mut self.steps)?;
+        let is_apart = !was_known[1] && counts(&self.steps) && step > STEP_MAX * reach;
+        is_apart.then_some(Oddity::StepsApart { centimetres: [step, reach].map(|m| (100.0 * m) as u32) })
     }
 
     /// Lays a view over the last one, if the body moved between them as far as it takes to tell readings apart.
@@ -254,12 +263,10 @@ impl Readings {
             return None;
         }
         let view = self.view.replace(View::new(*pose, points, reach))?;
-        if is_beyond {
-            return None;
-        }
-        self.pairs += u32::from(moved);
-        let found = self.judge(&view, pose, points, config);
-        self.is_over = found.is_some() || self.pairs >= PAIRS_MAX;
+        self.views += 1;
+        let found = if is_beyond { None } else { self.judge(&view, pose, points, config) };
+        self.pairs += u32::from(moved && !is_beyond);
+        self.is_over = found.is_some() || self.pairs >= PAIRS_MAX || self.views >= VIEWS_MAX;
         if self.is_over {
             self.view = None;
         }
@@ -296,13 +303,17 @@ impl Readings {
                 tally.hits += alone + both;
             }
         }
-        let is_clear =
-            |tally: &Tally| tally.wins >= WINS_MIN && f64::from(tally.wins) >= WINS_SHARE * f64::from(tally.pairs);
-        let clear = readings.into_iter().zip(&self.tallies).filter(|(_, tally)| is_clear(tally));
+        let holds = |tally: &Tally| f64::from(tally.wins) >= WINS_SHARE * f64::from(tally.pairs);
+        let all = || readings.iter().zip(&self.tallies);
         // Of equals the first, which is the commonest.
-        let per_win = |tally: &Tally| tally.hits as f64 / f64::from(tally.wins);
-        let best = clear.reduce(|best, next| if per_win(next.1) > per_win(best.1) { next } else { best });
-        best.map(|(reading, tally)| Oddity::Read { reading, pairs: [tally.wins, tally.pairs] })
+        let rank = |tally: &Tally| (tally.wins, tally.hits);
+        let best = all().reduce(|best, next| if rank(next.1) > rank(best.1) { next } else { best });
+        let (reading, tally) = best.filter(|(_, tally)| tally.wins >= WINS_MIN && holds(tally))?;
+        // On straight ways several readings come to the same motion.
+        let rivals = all().filter(|(other, tally)| *other != reading && holds(tally));
+        let rival = rivals.map(|(_, tally)| tally.wins).max().unwrap_or_default();
+        let is_told = tally.wins >= rival + LEAD_MIN || tally.pairs >= PAIRS_OF_RIVALS;
+        is_told.then_some(Oddity::Read { reading: *reading, pairs: [tally.wins, tally.pairs] })
     }
 }
 

@@ -142,3 +142,54 @@ fn few_points_and_a_body_that_stands_say_nothing() {
     let standing = drive(80, |_, points| (Se3::identity(), points));
     assert_eq!(reading(&standing[..1].iter().cycle().take(50).cloned().collect::<Vec<_>>()), None);
 }
+
+#[test]
+fn it_takes_six_pairs_and_looks_at_no_more_than_so_many() {
+    let inverse = |keyframe: &mut Keyframe| keyframe.pose.pose = keyframe.pose.pose.inverse();
+    let mut sent = drive(200, |pose, points| (pose, points));
+    let pairs_until = |keyframes: &[Keyframe]| {
+        let mut readings = Readings::default();
+        keyframes.iter().take_while(|keyframe| readings.look(keyframe, &config()).is_empty()).count();
+        (readings.pairs, readings.is_over)
+    };
+    let mut wrong = sent.clone();
+    wrong.iter_mut().for_each(inverse);
+    let (pairs, is_over) = pairs_until(&wrong);
+    assert!(is_over && (WINS_MIN..=PAIRS_OF_RIVALS).contains(&pairs), "{pairs}");
+    // A front end does not change its mind: what comes after so many pairs is not looked at.
+    let mut readings = Readings::default();
+    let last = sent.iter().position(|keyframe| {
+        readings.look(keyframe, &config());
+        readings.is_over
+    });
+    assert_eq!(readings.pairs, PAIRS_MAX);
+    sent.iter_mut().skip(last.unwrap()).for_each(inverse);
+    assert_eq!(reading(&sent), None);
+    // Nor are views looked at for ever that never overlap.
+    let mut readings = Readings::default();
+    let far = |k: u32| {
+        let pose = Se3::new(So3::identity(), Vector3::new(4.0 * f64::from(k), 0.0, 0.0));
+        Keyframe {
+            stamp: Stamp(i64::from(k) + 1),
+            pose: crate::geometry::PoseWithCovariance { pose, ..sent[0].pose },
+            ..sent[0].clone()
+        }
+    };
+    let looked = (0..2 * VIEWS_MAX).take_while(|k| {
+        readings.look(&far(*k), &config());
+        !readings.is_over
+    });
+    assert_eq!(looked.count(), VIEWS_MAX as usize);
+}
+
+#[test]
+fn lengths_are_told_beyond_their_bounds_and_not_before() {
+    let told = |reach: f64, step: f64| {
+        let seen: Vec<_> =
+            (0..100).map(|k| Vector3::new(reach * f64::from(k).sin(), reach * f64::from(k).cos(), 0.0)).collect();
+        let at = |k: i64| keyframe(k + 1, Se3::new(So3::identity(), Vector3::new(step * k as f64, 0.0, 0.0)), &seen);
+        found(&(0..20).map(at).collect::<Vec<_>>(), &config()).len()
+    };
+    assert_eq!([told(REACH_MAX_M - 1.0, 0.1), told(REACH_MAX_M + 1.0, 0.1)], [0, 1]);
+    assert_eq!([told(5.0, 5.0 * STEP_MAX - 0.1), told(5.0, 5.0 * STEP_MAX + 0.1)], [0, 1]);
+}

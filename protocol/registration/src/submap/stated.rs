@@ -28,6 +28,10 @@ const SAME: f64 = 1e-9;
 /// Submaps in a row that end by what is stated after a single keyframe, from which on it is no gap but a habit.
 pub const BLURRED_MAX: u32 = 5;
 
+/// What a robot on wheels does not measure (z, roll, pitch), if its rotation stands first. No robot knows its height and
+/// tilt, and neither where it is nor its heading.
+const ROTATION_FIRST: Axes = Axes([true, true, false, false, false, true]);
+
 /// Axes of a tangent (ρ, φ).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize)]
 pub struct Axes([bool; 6]);
@@ -146,12 +150,19 @@ impl fmt::Display for Oddity {
                 "one pose covariance is stated for all poses, which is no chain's: motions are taken to err by \
                  submap.gap_sigma_per_m of the way; state covariance_of = \"motion\", or covariances that grow",
             ),
-            Self::Blurs(axes) => write!(
-                f,
-                "the stated covariances are too large in {axes} for views to be laid over one another: each keyframe is a \
-                 submap of its own, and hardly any will merge; state what the odometry really errs by from keyframe to \
-                 keyframe, or raise submap.sigma_max_m and submap.sigma_max_deg"
-            ),
+            Self::Blurs(axes) => {
+                write!(
+                    f,
+                    "the stated covariances are too large in {axes} for views to be laid over one another: each keyframe is \
+                     a submap of its own, and hardly any will merge; "
+                )?;
+                f.write_str(if *axes == ROTATION_FIRST {
+                    "this is what wheels' covariances look like whose rotation stands first: state translation first"
+                } else {
+                    "state what the odometry really errs by from keyframe to keyframe, or raise submap.sigma_max_m and \
+                     submap.sigma_max_deg"
+                })
+            }
             Self::Read { reading, pairs: [wins, pairs] } => {
                 write!(f, "views lie over one another ({wins} pairs of {pairs}) if {reading}")
             }

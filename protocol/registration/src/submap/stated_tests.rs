@@ -51,6 +51,9 @@ fn what_is_not_known_ahead_ends_submaps_and_the_axes_are_named() {
         let [Oddity::Blurs(named)] = oddities[..] else { panic!("{oddities:?}") };
         assert_eq!(named.to_string(), axes);
     }
+    let odd = |sigmas| drive(30, sigmas, CovarianceOf::Motion).1[0].to_string();
+    assert!(odd([1e3, 1e3, 1e-3, 1e-3, 1e-3, 1e3]).contains("state translation first"));
+    assert!(odd([1e3, 1e-3, 1e-3, 1e-3, 1e-3, 1e3]).contains("or raise submap.sigma_max_m"));
     let few = drive(i64::from(BLURRED_MAX), [1.0; 6], CovarianceOf::Motion).1;
     assert_eq!(few, [], "a few gaps in a row are no habit");
     assert_eq!(drive(i64::from(BLURRED_MAX) + 1, [1.0; 6], CovarianceOf::Motion).1.len(), 1);
