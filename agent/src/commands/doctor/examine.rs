@@ -132,10 +132,7 @@ impl Examination {
         match pushed {
             Ok(closed) => self.keep(closed),
             Err(error) => {
-                // Numbers would make each of them another.
-                let kind: String =
-                    error.to_string().chars().map(|c| if c.is_ascii_digit() { '#' } else { c }).collect();
-                return self.refuse(kind.replace("##", "#"), 1);
+                return self.refuse(without_numbers(&error.to_string()), 1);
             }
         }
         self.remarks.extend(at.and_then(|at| self.habits.take(at, stamp)).map(|oddity| oddity.to_string()));
@@ -169,8 +166,8 @@ impl Examination {
         }
     }
 
-    /// What was seen. A SLAM that was listened to is expected to have sent something.
-    pub fn finish(mut self, was_listened_to: bool) -> Examined {
+    /// What was seen. `expected` is where a SLAM was listened for.
+    pub fn finish(mut self, expected: Option<&str>) -> Examined {
         self.close();
         let described: Vec<Described> =
             self.submaps.iter().map(|submap| describe(submap, &self.config.submap)).collect();
@@ -189,12 +186,10 @@ impl Examination {
                 looks.len()
             ));
         }
-        if self.keyframes == 0 && was_listened_to {
-            self.remarks.push(
-                "nothing that could be read was sent: is the SLAM connected to this endpoint, and does it publish \
-                 merganser/v1/SWARM/ROBOT/in/keyframe with the names in the configuration?"
-                    .into(),
-            );
+        if let Some(key) = expected.filter(|_| self.keyframes == 0) {
+            self.remarks.push(format!(
+                "nothing that could be used was sent: is the SLAM connected to this endpoint, and does it publish {key}?"
+            ));
         }
         for (reason, count) in &self.refused {
             self.remarks.push(format!("refused {count} times: {reason}"));
@@ -280,6 +275,13 @@ impl Examination {
         }
         all
     }
+}
+
+/// A reason to count by: numbers would make each of them another.
+fn without_numbers(reason: &str) -> String {
+    let mut chars: Vec<char> = reason.chars().map(|c| if c.is_ascii_digit() { '#' } else { c }).collect();
+    chars.dedup_by(|a, b| *a == '#' && *b == '#');
+    chars.into_iter().collect()
 }
 
 /// How far points are off, m; of many, evenly.

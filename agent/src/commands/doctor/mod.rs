@@ -6,6 +6,7 @@ mod report;
 
 use super::{BadInput, runtime, say};
 use crate::config::FileConfig;
+use crate::keys;
 use crate::link::overhear::overhear;
 use crate::recording::Recording;
 use crate::recording::import;
@@ -90,7 +91,8 @@ fn listen(config: &FileConfig, secs: f64) -> Result<Examined> {
         let since = first.map_or(Duration::ZERO, |first| at.duration_since(first));
         examination.take(Some(Instant::ZERO.after(since)), keyframe);
     }
-    Ok(examination.finish(true))
+    let key = keys::of(&config.swarm, &config.robot, "in/keyframe");
+    Ok(examination.finish(Some(&key)))
 }
 
 fn of_path(path: &Path) -> Result<Vec<Examined>> {
@@ -118,7 +120,7 @@ fn of_recording(recording: &Recording) -> Result<Examined> {
         }
         examination.take(None, recording.keyframe(index)?);
     }
-    Ok(examination.finish(false))
+    Ok(examination.finish(None))
 }
 
 /// A folder for what is made of a data set, gone when it is no longer needed.

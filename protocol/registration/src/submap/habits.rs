@@ -8,9 +8,9 @@ use crate::time::{Instant, Stamp};
 /// Stamps that rise so many times slower than time passes are not in nanoseconds: microseconds rise a thousand times
 /// slower. Simulations and replays that run slower than the clock, or faster, stay within.
 const SLOW: f64 = 200.0;
-/// Keyframes, and seconds by our own clock, that it takes to tell.
-const KEYFRAMES_MIN: u32 = 10;
-const SECS_MIN: f64 = 2.0;
+/// Keyframes that are looked at together, and how many such windows in a row must be so: a SLAM that was paused makes one.
+const KEYFRAMES: u32 = 5;
+const WINDOWS: u32 = 2;
 /// Submaps whose median of keypoints counts.
 const SUBMAPS: usize = 5;
 /// Fewer keypoints than this are too few: a motion takes three, and chance finds as many again.
@@ -19,9 +19,10 @@ pub const KEYPOINTS_MIN: usize = 6;
 /// What shows over many keyframes of one epoch.
 #[derive(Clone, Debug, Default)]
 pub struct Habits {
+    /// Where the window began.
     first: Option<(Instant, Stamp)>,
     keyframes: u32,
-    stamps_are_told: bool,
+    slow_windows: u32,
     keypoints: Vec<usize>,
     found: Vec<Oddity>,
 }
@@ -31,11 +32,15 @@ impl Habits {
     pub fn take(&mut self, now: Instant, stamp: Stamp) -> Option<Oddity> {
         let (since, first) = *self.first.get_or_insert((now, stamp));
         self.keyframes = self.keyframes.saturating_add(1);
-        let (passed, stated) = (now.since(since).as_secs_f64(), stamp.secs_since(first));
-        if self.stamps_are_told || self.keyframes < KEYFRAMES_MIN || passed < SECS_MIN || stated * SLOW > passed {
+        if self.slow_windows >= WINDOWS || self.keyframes <= KEYFRAMES {
             return None;
         }
-        self.stamps_are_told = true;
+        (self.first, self.keyframes) = (Some((now, stamp)), 1);
+        let (passed, stated) = (now.since(since).as_secs_f64(), stamp.secs_since(first));
+        self.slow_windows = if stated * SLOW > passed { 0 } else { self.slow_windows + 1 };
+        if self.slow_windows < WINDOWS {
+            return None;
+        }
         let orders = libm::log10(passed / stated.max(1e-9));
         let power = [3, 6, 9].into_iter().min_by(|a, b| {
             let off = |power: &u32| (orders - f64::from(*power)).abs();
@@ -90,6 +95,13 @@ mod tests {
         // A replay at a hundred times the speed, and a simulation at a hundredth.
         for per_sec in [100_000_000_000, 1_000_000_000, 10_000_000] {
             assert_eq!(told(per_sec), [], "{per_sec}");
+        }
+        // One that was paused for an hour.
+        let mut habits = Habits::default();
+        for k in 0..40_u32 {
+            let now =
+                Instant::ZERO.after(Duration::from_secs(u64::from(k / 20) * 3_600) + Duration::from_millis(500) * k);
+            assert_eq!(habits.take(now, Stamp(i64::from(k) * 500_000_000)), None);
         }
     }
 
