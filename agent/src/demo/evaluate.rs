@@ -7,7 +7,7 @@ use super::certainty::Certainty;
 use super::track::Track;
 use super::trajectory::{self, Corrected, TrajectoryError};
 use super::views::{Views, relative};
-use merganser_protocol::geometry::{Relative, Sim3, chi2};
+use merganser_protocol::geometry::{PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance, chi2};
 use merganser_protocol::snapshot::{PairStatus, PairView};
 use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::SVector;
@@ -124,7 +124,8 @@ pub struct Pair {
     pub t_a_b: Option<Relative>,
     /// True `t_a_b`.
     pub truth: Option<Sim3>,
-    /// Their difference.
+    /// Their difference, by where both robots began: of a SLAM that starts at its frame's origin, that is there. The origin
+    /// of map coordinates (UTM) is thousands of kilometres away, where a milliradian is kilometres.
     pub error: Option<PoseError>,
     /// That of the two anchors in the middle of what both saw: what a merge is worth shows there. The frames' origins may
     /// be far away.
@@ -252,12 +253,29 @@ fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {
             log10_nfa: view.and_then(|view| view.log10_nfa),
             t_a_b,
             truth,
-            error: t_a_b.zip(truth).zip(a.unit_m).map(|((t, truth), unit_m)| PoseError::of(&t, &truth, unit_m)),
+            error: t_a_b.zip(truth).zip(a.unit_m).map(|((t, truth), unit_m)| {
+                let (t, truth) = between_starts(&t, &truth, [a, b]);
+                PoseError::of(&t, &truth, unit_m)
+            }),
             middle: view.and_then(|view| middle(tracks, views, view)),
             certainty: Certainty::of(&views[0], &[&views[i], &views[j]].map(|views| views.frames.own.as_str())),
         });
     }
     pairs
+}
+
+/// How the first bodies of both robots lie, by an estimate and by the truth of `t_a_b`. Both know where they began in
+/// their own frames.
+pub(super) fn between_starts(t_a_b: &Relative, truth: &Sim3, tracks: [&Track; 2]) -> (Relative, Sim3) {
+    let [a, b] = tracks.map(|track| track.odometry.first().copied().unwrap_or_else(Se3::identity));
+    let to_first = a.inverse();
+    let estimate = match t_a_b.onto(&b) {
+        Relative::Metric(t) => Relative::Metric(PoseWithCovariance { pose: to_first * t.pose, ..t }),
+        Relative::Similarity(t) => {
+            Relative::Similarity(SimWithCovariance { sim: Sim3::from_se3(&to_first) * t.sim, ..t })
+        }
+    };
+    (estimate, Sim3::from_se3(&to_first) * *truth * Sim3::from_se3(&b))
 }
 
 /// True `t_world_anchor` of a submap, `name/epoch#index`, of any of the robots.

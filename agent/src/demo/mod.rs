@@ -17,6 +17,8 @@ mod watch;
 #[cfg(test)]
 mod certainty_tests;
 #[cfg(test)]
+mod far_tests;
+#[cfg(test)]
 mod scale_tests;
 #[cfg(test)]
 mod tests;
@@ -178,10 +180,14 @@ fn write(
         evaluation.trajectory.as_ref().map_or(String::new(), |t| format!(", trajectory error {:.3} m", t.merged_m.1));
     let headline = format!("{keyframes} keyframes, {:.1} s{error}", seen.after.as_secs_f64());
     let outcome = Outcome { recordings, tracks, views: &seen.views, evaluation, headline };
-    let files = outputs::write(&outcome, out)?;
+    let (files, offset) = outputs::write(&outcome, out)?;
     let names: Vec<String> =
         files.iter().filter_map(|path| Some(path.file_name()?.to_string_lossy().into_owned())).collect();
-    Ok(names.join(", "))
+    let told = offset.map_or(String::new(), |offset| {
+        let [x, y, z] = offset.into();
+        format!("; the merged map is written relative to ({x}, {y}, {z}), so that 32 bits suffice")
+    });
+    Ok(names.join(", ") + &told)
 }
 
 fn told(seen: &Seen) -> String {

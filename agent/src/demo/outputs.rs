@@ -28,6 +28,10 @@ const SCALED_CONVENTIONS: &str = "t_a_b maps frame b into frame a, p_a = scale R
      is one), of the local perturbation T exp(δ); translations in units of a, their covariances in units of b, angles in \
      rad; an error's scale is the estimate over the truth, its translation_m in m; units_m is what one is in each robot's \
      frame, null if unknown; the merged map and the paths are in units of the reference frame";
+/// Numbers of 32 bits are a millimetre apart from here on, m (or units).
+const EXACT_MAX: f64 = 8_192.0;
+/// An offset is easier to type if it is round, m (or units).
+const OFFSET_STEP: f64 = 100.0;
 /// The merged map is thinned to one point per robot in cubes of this share of the submaps' voxel.
 const THIN: f64 = 0.5;
 /// Robots' colours, told apart by colour-blind people too (Okabe and Ito).
@@ -51,8 +55,8 @@ pub(super) struct Cloud {
     pub common: Vec<Vector3<f64>>,
 }
 
-/// Writes all files into `folder` and returns their paths.
-pub(super) fn write(result: &Outcome, folder: &Path) -> Result<Vec<PathBuf>> {
+/// Writes all files into `folder` and returns their paths, and what the merged map is written relative to, if it is.
+pub(super) fn write(result: &Outcome, folder: &Path) -> Result<(Vec<PathBuf>, Option<Vector3<f64>>)> {
     let mut clouds = Vec::new();
     for (recording, corrected) in result.recordings.iter().zip(&result.evaluation.corrected) {
         clouds.push(cloud(recording, corrected.as_ref())?);
@@ -64,7 +68,8 @@ pub(super) fn write(result: &Outcome, folder: &Path) -> Result<Vec<PathBuf>> {
         written.push(path);
         Ok(())
     };
-    put(MERGED.into(), merged_ply(&clouds))?;
+    let offset = offset_of(&clouds);
+    put(MERGED.into(), merged_ply(&clouds, offset))?;
     for (track, corrected) in result.tracks.iter().zip(&result.evaluation.corrected) {
         if let Some(corrected) = corrected {
             put(format!("robot_{}.tum", track.name), tum(&track.stamps_secs, &corrected.poses).into())?;
@@ -74,7 +79,7 @@ pub(super) fn write(result: &Outcome, folder: &Path) -> Result<Vec<PathBuf>> {
     let svg = picture::draw(&scene::scene(result, &clouds));
     put(PNG.into(), picture::png(&svg, 1.0)?)?;
     put(SVG.into(), svg.into())?;
-    Ok(written)
+    Ok((written, offset))
 }
 
 /// Removes what an earlier run left, so that nothing of it passes for this one's. A folder without [`MERGED`] is
@@ -120,12 +125,28 @@ fn cloud(recording: &Recording, corrected: Option<&Corrected>) -> Result<Cloud> 
     Ok(cloud)
 }
 
-fn merged_ply(clouds: &[Cloud]) -> Vec<u8> {
+pub(super) fn merged_ply(clouds: &[Cloud], offset: Option<Vector3<f64>>) -> Vec<u8> {
     let mut points = Vec::new();
+    let from = offset.unwrap_or_default();
     for (cloud, colour) in clouds.iter().zip(COLOURS.iter().cycle()) {
-        points.extend(cloud.common.iter().map(|p| (<[f32; 3]>::from(p.map(|x| x as f32)), *colour)));
+        points.extend(cloud.common.iter().map(|p| (<[f32; 3]>::from((p - from).map(|x| x as f32)), *colour)));
     }
-    ply::encode_coloured(points.len(), points.iter().map(|(point, colour)| (point, *colour)))
+    let comment = offset.map(|offset| {
+        let [x, y, z] = offset.into();
+        format!("offset {x} {y} {z}: to be added to each vertex")
+    });
+    ply::encode_coloured(points.len(), points.iter().map(|(point, colour)| (point, *colour)), comment.as_deref())
+}
+
+/// What points are written relative to, in whole steps of [`OFFSET_STEP`], where single precision would blur them.
+pub(super) fn offset_of(clouds: &[Cloud]) -> Option<Vector3<f64>> {
+    let points = || clouds.iter().flat_map(|cloud| &cloud.common);
+    if points().all(|p| p.amax() < EXACT_MAX) {
+        return None;
+    }
+    let low = points().copied().reduce(|a, b| a.inf(&b))?;
+    let high = points().copied().reduce(|a, b| a.sup(&b))?;
+    Some(((low + high) / (2.0 * OFFSET_STEP)).map(|steps| steps.round() * OFFSET_STEP))
 }
 
 /// The TUM format: `stamp x y z qx qy qz qw`, a pose a line.

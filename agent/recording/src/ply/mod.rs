@@ -61,14 +61,18 @@ pub(super) fn columns(bytes: &[u8], wanted: &[&str]) -> Result<Vec<Option<Vec<f6
 
 /// A binary little-endian PLY of x, y, z as floats.
 pub(super) fn encode(points: &[[f32; 3]]) -> Vec<u8> {
-    let mut bytes = head(points.len(), "");
+    let mut bytes = head(points.len(), None, "");
     bytes.extend(points.iter().flatten().flat_map(|c| c.to_le_bytes()));
     bytes
 }
 
-/// A binary little-endian PLY of coloured points: x, y, z as floats; red, green, blue as bytes.
-pub fn encode_coloured<'a>(count: usize, points: impl Iterator<Item = (&'a [f32; 3], [u8; 3])>) -> Vec<u8> {
-    let mut bytes = head(count, "property uchar red\nproperty uchar green\nproperty uchar blue\n");
+/// A binary little-endian PLY of coloured points: x, y, z as floats; red, green, blue as bytes. `comment` is one line.
+pub fn encode_coloured<'a>(
+    count: usize,
+    points: impl Iterator<Item = (&'a [f32; 3], [u8; 3])>,
+    comment: Option<&str>,
+) -> Vec<u8> {
+    let mut bytes = head(count, comment, "property uchar red\nproperty uchar green\nproperty uchar blue\n");
     for (point, colour) in points {
         bytes.extend(point.iter().flat_map(|c| c.to_le_bytes()));
         bytes.extend(colour);
@@ -78,7 +82,7 @@ pub fn encode_coloured<'a>(count: usize, points: impl Iterator<Item = (&'a [f32;
 
 /// A binary little-endian PLY of x, y, z as floats and further properties, whose values are `more`, vertex by vertex.
 pub(super) fn encode_with(points: &[[f32; 3]], properties: &str, more: impl Iterator<Item = Vec<u8>>) -> Vec<u8> {
-    let mut bytes = head(points.len(), properties);
+    let mut bytes = head(points.len(), None, properties);
     for (point, more) in points.iter().zip(more) {
         bytes.extend(point.iter().flat_map(|c| c.to_le_bytes()));
         bytes.extend(more);
@@ -86,9 +90,10 @@ pub(super) fn encode_with(points: &[[f32; 3]], properties: &str, more: impl Iter
     bytes
 }
 
-fn head(count: usize, more: &str) -> Vec<u8> {
+fn head(count: usize, comment: Option<&str>, more: &str) -> Vec<u8> {
+    let comment = comment.map_or(String::new(), |text| format!("comment {text}\n"));
     format!(
-        "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n\
+        "ply\nformat binary_little_endian 1.0\n{comment}element vertex {count}\n\
          property float x\nproperty float y\nproperty float z\n{more}end_header\n"
     )
     .into_bytes()

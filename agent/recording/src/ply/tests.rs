@@ -39,7 +39,8 @@ fn binary_with_other_properties_reads() {
         bytes.extend((-i).to_le_bytes());
     }
     assert_eq!(points(&bytes), [[0.5, 0.0, 0.0], [1.5, 1.0, -1.0]]);
-    let coloured = encode_coloured(2, [([1.0, 2.0, 3.0], [9; 3]), ([4.0; 3], [1; 3])].iter().map(|(p, c)| (p, *c)));
+    let coloured =
+        encode_coloured(2, [([1.0, 2.0, 3.0], [9; 3]), ([4.0; 3], [1; 3])].iter().map(|(p, c)| (p, *c)), None);
     assert_eq!(points(&coloured), [[1.0, 2.0, 3.0], [4.0; 3]]);
 }
 
