@@ -16,6 +16,8 @@ use zenoh::sample::Sample;
 /// Keyframes that are kept at most, and their points.
 const KEYFRAMES_MAX: usize = 4_096;
 const POINTS_MAX: usize = 20_000_000;
+/// Reasons that are told apart.
+const REASONS_MAX: usize = 16;
 /// How long a session may take to close.
 const CLOSE_WAIT: Duration = Duration::from_secs(2);
 
@@ -36,16 +38,21 @@ impl Overheard {
                 self.points += keyframe.points.len();
                 if self.keyframes.len() < KEYFRAMES_MAX && self.points < POINTS_MAX {
                     self.keyframes.push((Instant::now(), keyframe));
+                } else {
+                    self.refuse(format!(
+                        "more than {KEYFRAMES_MAX} keyframes or {POINTS_MAX} points are not kept; listen for fewer seconds"
+                    ));
                 }
             }
             Ok(_) => {}
-            Err(reason) => {
-                let kinds = self.refused.len();
-                if kinds < 16 || self.refused.contains_key(&reason) {
-                    *self.refused.entry(reason).or_default() += 1;
-                }
-            }
+            Err(reason) => self.refuse(reason),
         }
+    }
+
+    fn refuse(&mut self, reason: String) {
+        let is_known = self.refused.len() < REASONS_MAX || self.refused.contains_key(&reason);
+        let reason = if is_known { reason } else { "for other reasons".into() };
+        *self.refused.entry(reason).or_default() += 1;
     }
 }
 
@@ -76,4 +83,18 @@ pub async fn overhear(
     session::close(&session, CLOSE_WAIT).await;
     let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
     Ok(core::mem::take(&mut *heard))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn so_many_reasons_are_told_apart_and_the_rest_is_counted_together() {
+        let mut heard = Overheard::default();
+        (0..2 * REASONS_MAX).for_each(|k| heard.take(Err(k.to_string())));
+        heard.take(Err("0".into()));
+        assert_eq!(heard.refused.len(), REASONS_MAX + 1);
+        assert_eq!((heard.refused["0"], heard.refused["for other reasons"]), (2, REASONS_MAX as u64));
+    }
 }

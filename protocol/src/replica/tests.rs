@@ -122,39 +122,6 @@ fn early_entries_are_bounded_and_the_nearest_are_kept() {
 }
 
 #[test]
-fn lengths_and_epochs_are_bounded_on_both_sides() {
-    let limits = GossipConfig { entries_per_frame_max: 3, epochs_per_robot_max: 2, ..GossipConfig::default() };
-    let mut replica = replica_with(&limits);
-    let entries = chain(1, 0, 4, 0);
-    feed(&mut replica, &entries[..2]);
-    assert!(matches!(replica.ingest(&entries[2]), Ok(Ingested::New(_))));
-    assert_eq!(replica.ingest(&entries[3]), Err(IngestError::SeqLimit(id(1, 0, 3))));
-    for epoch in 7..10 {
-        assert!(matches!(replica.ingest(&chain(1, epoch, 1, 0)[0]), Ok(Ingested::New(_))));
-    }
-    assert_eq!(
-        replica.ingest(&chain(1, 10, 1, 0)[0]),
-        Err(IngestError::EpochLimit(robot(1))),
-        "they wait for the disk"
-    );
-    assert!(matches!(replica.ingest(&chain(2, 8, 1, 0)[0]), Ok(Ingested::New(_))));
-    settle(&mut replica);
-    assert_eq!(replica.epochs_of(robot(1)).collect::<Vec<_>>(), [8, 9]);
-    assert_eq!(replica.ingest(&chain(1, 6, 1, 0)[0]), Ok(Ingested::Known), "older than those that are held");
-
-    for k in 0..3 {
-        replica.append(&key(0), 0, &fact(k)).unwrap();
-    }
-    assert!(matches!(replica.append(&key(0), 0, &fact(3)), Err(AppendError::NewEpochNeeded(..))));
-    replica.append(&key(0), 1, &fact(0)).unwrap();
-    settle(&mut replica);
-    replica.append(&key(0), 2, &fact(0)).unwrap();
-    assert_eq!(replica.epochs_of(robot(0)).collect::<Vec<_>>(), [0, 1, 2], "until it is durable");
-    settle(&mut replica);
-    assert_eq!(replica.epochs_of(robot(0)).collect::<Vec<_>>(), [1, 2]);
-}
-
-#[test]
 fn floors_never_fall() {
     let mut replica = replica();
     let a = signed(1, 0, 0, 0, Hash::default(), &fact(0));

@@ -10,7 +10,7 @@ use crate::keys;
 use crate::link::overhear::overhear;
 use crate::recording::Recording;
 use crate::recording::import;
-use anyhow::Result;
+use anyhow::{Context, Result};
 pub use examine::{Examination, Examined};
 use merganser_protocol::time::Instant;
 use std::path::{Path, PathBuf};
@@ -99,7 +99,7 @@ fn of_path(path: &Path) -> Result<Vec<Examined>> {
     if path.join(crate::recording::MANIFEST).is_file() {
         return Ok(vec![of_recording(&Recording::open(path)?)?]);
     }
-    let scratch = Scratch::new();
+    let scratch = Scratch::new()?;
     let prepared = if path.is_file() {
         import::prepare_log(path, &scratch.0, LOG_ROBOTS)?
     } else {
@@ -127,13 +127,16 @@ fn of_recording(recording: &Recording) -> Result<Examined> {
 struct Scratch(PathBuf);
 
 impl Scratch {
-    fn new() -> Self {
-        Self(std::env::temp_dir().join(format!("merganser-doctor-{}", std::process::id())))
+    /// A new one: what stands there already is somebody else's, and is not removed.
+    fn new() -> Result<Self> {
+        let path = std::env::temp_dir().join(format!("merganser-doctor-{}", std::process::id()));
+        std::fs::create_dir(&path).with_context(|| format!("cannot make {}", path.display()))?;
+        Ok(Self(path))
     }
 }
 
 impl Drop for Scratch {
     fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0); // of a data set of recordings nothing was made
+        let _ = std::fs::remove_dir_all(&self.0); // what is left there does no harm
     }
 }

@@ -207,7 +207,9 @@ pub struct Readings {
     view: Option<View>,
     tallies: Vec<Tally>,
     pairs: u32,
+    /// Views that were replaced because the body moved on, and pairs that only millimetres would tell apart.
     views: u32,
+    trembles: u32,
     is_over: bool,
     last: Option<(Stamp, Se3)>,
     reaches: Vec<f64>,
@@ -259,16 +261,19 @@ impl Readings {
         view.age += 1;
         let t = view.t_frame_body.inverse() * *pose;
         let [turn, way] = [t.rotation.angle(), t.translation.norm() / view.reach];
-        let is_beyond = turn > TURN[1] || way > WAY[1] || view.age > AGE_MAX;
+        let is_far = turn > TURN[1] || way > WAY[1];
         let moved = turn >= TURN[0] || way >= WAY[0];
-        let moved_in_millimetres = (WAY[0]..=WAY[1]).contains(&(1000.0 * way));
-        if !is_beyond && !moved && !moved_in_millimetres {
+        // So does a body that stands and whose odometry trembles: it may not use up what it takes to judge a drive.
+        let in_millimetres = !moved && self.trembles < PAIRS_MAX && (WAY[0]..=WAY[1]).contains(&(1000.0 * way));
+        let is_old = view.age > AGE_MAX;
+        if !moved && !in_millimetres && !is_old {
             return None;
         }
         let view = self.view.replace(View::new(*pose, points, reach))?;
-        self.views += 1;
-        let found = if is_beyond { None } else { self.judge(&view, pose, points, config) };
-        self.pairs += u32::from(moved && !is_beyond);
+        self.views += u32::from(moved);
+        self.trembles += u32::from(in_millimetres);
+        let found = if is_far || is_old { None } else { self.judge(&view, pose, points, config) };
+        self.pairs += u32::from(moved && !is_far && !is_old);
         self.is_over = found.is_some() || self.pairs >= PAIRS_MAX || self.views >= VIEWS_MAX;
         if self.is_over {
             self.view = None;

@@ -182,6 +182,26 @@ fn it_takes_six_pairs_and_looks_at_no_more_than_so_many() {
     assert_eq!(looked.count(), VIEWS_MAX as usize);
 }
 
+/// A robot that stands for long before it drives, as most do, is judged when it drives.
+#[test]
+fn a_body_that_stands_first_is_judged_when_it_drives() {
+    let driven = drive(80, |pose, points| (pose.inverse(), points));
+    for tremble in [0.0, 1e-3] {
+        let mut readings = Readings::default();
+        for k in 0..3 * i64::from(VIEWS_MAX) {
+            let off = Vector3::new(tremble * (k % 2) as f64, 0.0, 0.0);
+            let pose = Se3::new(So3::identity(), off);
+            let stands = crate::geometry::PoseWithCovariance { pose, ..driven[0].pose };
+            let odd =
+                readings.look(&Keyframe { stamp: Stamp(k - 1_000_000), pose: stands, ..driven[0].clone() }, &config());
+            assert_eq!(odd, []);
+        }
+        assert!(!readings.is_over, "{tremble}");
+        let odd: Vec<Oddity> = driven.iter().flat_map(|keyframe| readings.look(keyframe, &config())).collect();
+        assert!(matches!(odd[..], [Oddity::Read { reading: Reading::Inverse, .. }]), "{tremble}: {odd:?}");
+    }
+}
+
 #[test]
 fn lengths_are_told_beyond_their_bounds_and_not_before() {
     let told = |reach: f64, step: f64| {
