@@ -5,7 +5,9 @@
 
 use super::matching::Pairing;
 use super::scene::{Cloud, Pose};
+use crate::simd::wide;
 use nalgebra::{Matrix3, Matrix4, Vector3};
+use pulp::Arch;
 
 /// Distances of a pair agree within this.
 const LENGTH_TOLERANCE: f64 = 1.5;
@@ -75,9 +77,13 @@ impl Agreement {
     fn of(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Self {
         let words = matches.len().div_ceil(64);
         let mut agreement = Self { words, bits: vec![0; words * matches.len()], pairs: Vec::new() };
+        let arch = Arch::new();
+        let ends = Ends::of(theirs, mine, matches);
+        let mut fits = vec![false; matches.len()];
         for (x, first) in matches.iter().enumerate() {
+            ends.fit(arch, x, &mut fits);
             for (y, second) in matches.iter().enumerate().skip(x + 1) {
-                if agree(theirs, mine, first, second) {
+                if fits[y] && agree(theirs, mine, first, second) {
                     agreement.bits[x * words + y / 64] |= 1 << (y % 64);
                     agreement.bits[y * words + x / 64] |= 1 << (x % 64);
                     agreement.pairs.push((x as u32, y as u32));
@@ -100,14 +106,80 @@ impl Agreement {
         both.flat_map(|(word, bits)| (0..64).filter(move |bit| bits >> bit & 1 == 1).map(move |bit| 64 * word + bit))
     }
 
-    /// The pairs, those with the most in common first.
+    /// The pairs, those with the most in common first, of equal ones the first found: they are counted into places, as
+    /// there are hundreds of thousands of pairs and some hundreds of counts.
     fn ranked(&self) -> Vec<(u32, u32)> {
-        let common = |&(x, y): &(u32, u32)| -> u32 {
-            self.row(x as usize).iter().zip(self.row(y as usize)).map(|(a, b)| (a & b).count_ones()).sum()
+        let common = self.commons();
+        let most = common.iter().copied().max().unwrap_or(0) as usize;
+        let place = |common: u32| most - common as usize;
+        let mut starts = vec![0_usize; most + 2];
+        common.iter().for_each(|&common| starts[place(common) + 1] += 1);
+        for k in 1..starts.len() {
+            starts[k] += starts[k - 1];
+        }
+        let mut ranked = vec![(0, 0); self.pairs.len()];
+        for (pair, &common) in self.pairs.iter().zip(&common) {
+            let next = &mut starts[place(common)];
+            ranked[*next] = *pair;
+            *next += 1;
+        }
+        ranked
+    }
+
+    /// For each pair the number of matches that agree with both.
+    fn commons(&self) -> Vec<u32> {
+        wide(
+            Arch::new(),
+            #[inline(always)]
+            || {
+                let mut commons = Vec::with_capacity(self.pairs.len());
+                for &(x, y) in &self.pairs {
+                    let mut common = 0;
+                    for (a, b) in self.row(x as usize).iter().zip(self.row(y as usize)) {
+                        common += (a & b).count_ones();
+                    }
+                    commons.push(common);
+                }
+                commons
+            },
+        )
+    }
+}
+
+/// The ends of matches, coordinate by coordinate, so that the distances of one match from all are worked out together.
+struct Ends {
+    theirs: [Vec<f64>; 3],
+    mine: [Vec<f64>; 3],
+}
+
+impl Ends {
+    fn of(theirs: &Cloud, mine: &Cloud, matches: &[Pairing]) -> Self {
+        let along = |axis: usize| {
+            (
+                matches.iter().map(|p| theirs.points[p.their as usize][axis]).collect(),
+                matches.iter().map(|p| mine.points[p.my as usize][axis]).collect(),
+            )
         };
-        let mut ranked: Vec<_> = self.pairs.iter().map(|pair| (core::cmp::Reverse(common(pair)), *pair)).collect();
-        ranked.sort_unstable();
-        ranked.into_iter().map(|(_, pair)| pair).collect()
+        let [x, y, z] = [0, 1, 2].map(along);
+        Self { theirs: [x.0, y.0, z.0], mine: [x.1, y.1, z.1] }
+    }
+
+    /// Whether each match after `x` is as far from it at both ends: the first part of [`agree`], which lets few pass.
+    fn fit(&self, arch: Arch, x: usize, fits: &mut [bool]) {
+        let from = [&self.theirs, &self.mine].map(|ends| [ends[0][x], ends[1][x], ends[2][x]]);
+        wide(
+            arch,
+            #[inline(always)]
+            || {
+                let count = fits.len();
+                let [tx, ty, tz] = [0, 1, 2].map(|axis| &self.theirs[axis][..count]);
+                let [mx, my, mz] = [0, 1, 2].map(|axis| &self.mine[axis][..count]);
+                for y in x + 1..count {
+                    let their = length([tx[y], ty[y], tz[y]], from[0]);
+                    fits[y] = lengths_agree(their, length([mx[y], my[y], mz[y]], from[1]));
+                }
+            },
+        );
     }
 }
 
@@ -120,7 +192,7 @@ fn agree(theirs: &Cloud, mine: &Cloud, first: &Pairing, second: &Pairing) -> boo
     let [m1, m2] = [first.my, second.my].map(|k| k as usize);
     let (dt, dm) = (theirs.points[t2] - theirs.points[t1], mine.points[m2] - mine.points[m1]);
     let (lt, lm) = (dt.norm(), dm.norm());
-    if (lt - lm).abs() > LENGTH_TOLERANCE || lt < LENGTH_MIN || lm < LENGTH_MIN {
+    if !lengths_agree(lt, lm) {
         return false;
     }
     let (n1, n2) = (&theirs.normals[t1], &theirs.normals[t2]);
@@ -128,6 +200,19 @@ fn agree(theirs: &Cloud, mine: &Cloud, first: &Pairing, second: &Pairing) -> boo
     (n1.dot(n2) - k1.dot(k2)).abs() <= COSINE_TOLERANCE
         && (n1.dot(&dt) / lt - k1.dot(&dm) / lm).abs() <= COSINE_TOLERANCE
         && (n2.dot(&dt) / lt - k2.dot(&dm) / lm).abs() <= COSINE_TOLERANCE
+}
+
+/// The distance of two points, in the order of sums of a vector's norm.
+#[inline(always)]
+fn length(to: [f64; 3], from: [f64; 3]) -> f64 {
+    let [x, y, z] = [to[0] - from[0], to[1] - from[1], to[2] - from[2]];
+    (x * x + y * y + z * z).sqrt()
+}
+
+/// Whether two matches are as far from each other at both ends, and far enough to tell a rotation.
+#[inline(always)]
+fn lengths_agree(theirs: f64, mine: f64) -> bool {
+    !(((theirs - mine).abs() > LENGTH_TOLERANCE) | (theirs < LENGTH_MIN) | (mine < LENGTH_MIN))
 }
 
 /// The pose of the first two matches, then of all that are near it.

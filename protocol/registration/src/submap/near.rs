@@ -17,6 +17,13 @@ pub struct Piece {
     pub normal: [f32; 3],
 }
 
+impl Piece {
+    /// The squared distance from a place.
+    fn squared(&self, at: &[f32; 3]) -> f32 {
+        (0..3).map(|k| (self.point[k] - at[k]) * (self.point[k] - at[k])).sum()
+    }
+}
+
 /// Pieces of surface sorted into cells.
 pub struct Near {
     edge: f32,
@@ -59,46 +66,44 @@ impl Near {
     /// The piece nearest to `at` within `radius` of those that `fit`; of several, the first sorted in.
     pub fn nearest(&self, at: &[f32; 3], radius: f32, fits: impl Fn(&Piece) -> bool) -> Option<&Piece> {
         let mut best = (radius * radius, None);
-        self.look(at, radius, |piece, squared| {
+        for piece in self.rows(at, radius).flatten() {
+            let squared = piece.squared(at);
             let nearer = squared < best.0 || (squared == best.0 && best.1.is_none());
             if nearer && fits(piece) {
                 best = (squared, Some(piece));
             }
-        });
+        }
         best.1
     }
 
-    /// Shows every piece within `radius` of `at`.
-    pub fn within(&self, at: &[f32; 3], radius: f32, mut each: impl FnMut(&Piece)) {
-        self.look(at, radius, |piece, squared| {
-            if squared <= radius * radius {
-                each(piece);
-            }
-        });
+    /// Whether a piece that `fits` lies within `radius` of `at`: what [`nearest`](Self::nearest) finds, but the first is
+    /// enough.
+    pub fn any(&self, at: &[f32; 3], radius: f32, fits: impl Fn(&Piece) -> bool) -> bool {
+        let here = |piece: &Piece| piece.squared(at) <= radius * radius && fits(piece);
+        self.rows(at, radius).any(|row| row.iter().any(here))
     }
 
-    /// Shows the pieces of every cell within `radius`, with their squared distances.
-    fn look<'a>(&'a self, at: &[f32; 3], radius: f32, mut each: impl FnMut(&'a Piece, f32)) {
-        if self.pieces.is_empty() {
-            return;
-        }
+    /// Shows every piece within `radius` of `at`.
+    pub fn within(&self, at: &[f32; 3], radius: f32, each: impl FnMut(&Piece)) {
+        let pieces = self.rows(at, radius).flatten();
+        pieces.filter(|piece| piece.squared(at) <= radius * radius).for_each(each);
+    }
+
+    /// The pieces of every cell within `radius` of `at`, row by row of cells.
+    fn rows(&self, at: &[f32; 3], radius: f32) -> impl Iterator<Item = &[Piece]> {
         let mut run = [(0, 0); 3];
         for k in 0..3 {
             let (from, to) = (self.cell(at[k] - radius, k).max(0), self.cell(at[k] + radius, k));
             let to = to.min(self.dims[k] as i64 - 1);
-            if from > to {
-                return;
-            }
-            run[k] = (from as usize, to as usize);
+            // Past the end of this axis, or of a table of nothing: no row.
+            run[k] = if from > to { (1, 0) } else { (from as usize, to as usize) };
         }
-        for x in run[0].0..=run[0].1 {
-            for y in run[1].0..=run[1].1 {
-                let (first, last) = (self.position(x, y, run[2].0), self.position(x, y, run[2].1));
-                for piece in &self.pieces[self.starts[first] as usize..self.starts[last + 1] as usize] {
-                    each(piece, (0..3).map(|k| (piece.point[k] - at[k]) * (piece.point[k] - at[k])).sum());
-                }
-            }
-        }
+        let [x, y, z] = run.map(|(from, to)| from..to + 1);
+        let rows = if z.is_empty() { 0..0 } else { x };
+        rows.flat_map(move |x| y.clone().map(move |y| (x, y))).map(move |(x, y)| {
+            let (first, last) = (self.position(x, y, z.start), self.position(x, y, z.end - 1));
+            &self.pieces[self.starts[first] as usize..self.starts[last + 1] as usize]
+        })
     }
 
     /// The cell of a coordinate, which may lie outside of the table: just before it counts as the first. Saturates.
@@ -115,10 +120,6 @@ impl Near {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-
-    fn squared(piece: &Piece, at: &[f32; 3]) -> f32 {
-        (0..3).map(|k| (piece.point[k] - at[k]) * (piece.point[k] - at[k])).sum()
-    }
 
     proptest! {
         /// Lattices hold the ties that clouds of walls hold; one far point makes the table coarse.
@@ -137,10 +138,12 @@ mod tests {
             pieces.extend(far.map(|x| Piece { point: [x, -x, x], normal: [0.0, 0.0, 1.0] }));
             let at = [at.0, at.1, at.2].map(|c| c as f32 * 0.25);
             let up = |piece: &Piece| piece.normal[2] > 0.5;
-            let found = Near::new(&pieces).nearest(&at, radius, up).map(|piece| squared(piece, &at));
-            let all = pieces.iter().filter(|piece| up(piece)).map(|piece| squared(piece, &at));
+            let near = Near::new(&pieces);
+            let found = near.nearest(&at, radius, up).map(|piece| piece.squared(&at));
+            let all = pieces.iter().filter(|piece| up(piece)).map(|piece| piece.squared(&at));
             let expected = all.filter(|d| *d <= radius * radius).min_by(f32::total_cmp);
             prop_assert_eq!(found, expected);
+            prop_assert_eq!(near.any(&at, radius, up), expected.is_some());
         }
     }
 

@@ -81,18 +81,15 @@ impl Scene {
         normal: &Vector3<f64>,
         radius: f32,
     ) -> Option<(Vector3<f64>, Vector3<f64>)> {
-        let found = self.facing(at, normal, radius)?;
+        let n = single(normal);
+        let found = self.surface.nearest(&single(at), radius, |piece| dot(&piece.normal, &n) >= NORMALS_COS_MIN)?;
         Some((Vector3::from(found.point.map(f64::from)), Vector3::from(found.normal.map(f64::from))))
     }
 
     /// Whether a point of theirs at `at` with `normal` lies on my surface.
     pub fn confirms(&self, at: &Vector3<f64>, normal: &Vector3<f64>) -> bool {
-        self.facing(at, normal, NEAR).is_some()
-    }
-
-    fn facing(&self, at: &Vector3<f64>, normal: &Vector3<f64>, radius: f32) -> Option<&Piece> {
         let n = single(normal);
-        self.surface.nearest(&single(at), radius, |piece| dot(&piece.normal, &n) >= NORMALS_COS_MIN)
+        self.surface.any(&single(at), NEAR, |piece| dot(&piece.normal, &n) >= NORMALS_COS_MIN)
     }
 
     /// A first look at a point of theirs.
@@ -114,7 +111,7 @@ impl Scene {
             let lies = dot(&aside, &mine.normal).abs() <= CLOSE_PLANE_MAX;
             return (if lies { Verdict::Confirmed } else { Verdict::Unknown }, true);
         }
-        if self.surface.nearest(&p, NEAR, |_| true).is_some() {
+        if self.surface.any(&p, NEAR, |_| true) {
             (Verdict::Unknown, true)
         } else if self.views.looked_through(at) {
             (Verdict::Contradicted, false)

@@ -3,6 +3,7 @@
 //! poses: no trigonometry, no search. Lengths are in voxels.
 
 use super::features::Features;
+use core::ops::RangeInclusive;
 use nalgebra::Vector3;
 
 /// Pixels along an edge of a face.
@@ -24,7 +25,7 @@ struct View {
     from: Vector3<f64>,
     /// The nearest range in each pixel of each face; infinite where nothing was seen.
     nearest: Vec<f32>,
-    /// Whether this keyframe itself saw something there.
+    /// Whether this keyframe itself saw something there or in a pixel beside it.
     seen: Vec<bool>,
 }
 
@@ -38,11 +39,17 @@ impl Views {
                 nearest: vec![f32::INFINITY; 6 * PIXELS * PIXELS],
                 seen: vec![false; 6 * PIXELS * PIXELS],
             };
+            let mut seen = vec![false; view.seen.len()];
             for (p, &by) in points.iter().zip(mine.seen_from()) {
                 let Some((face, u, v, range)) = view.pixel(&Vector3::from(p.map(f64::from))) else { continue };
                 let at = position(face, u, v);
                 view.nearest[at] = view.nearest[at].min(range);
-                view.seen[at] |= usize::from(by) == k;
+                if usize::from(by) == k && !seen[at] {
+                    seen[at] = true;
+                    for u in around(u, 1) {
+                        view.seen[position(face, u, 0)..][around(v, 1)].fill(true);
+                    }
+                }
             }
             view
         };
@@ -58,15 +65,19 @@ impl Views {
 impl View {
     fn looked_through(&self, at: &Vector3<f64>) -> bool {
         let Some((face, u, v, range)) = self.pixel(at) else { return false };
+        let behind = range + BEHIND;
+        let middle = position(face, u, v);
+        // Most places lie where this keyframe saw nothing, or something nearer.
+        if !self.seen[middle] || self.nearest[middle] < behind {
+            return false;
+        }
         // A pixel in the middle of a face is 2 / PIXELS wide at unit distance.
         let window = (SHADOW / range * PIXELS as f32 / 2.0).ceil() as usize;
         if window > WINDOW_MAX {
             return false;
         }
-        let around = |c: usize, by: usize| c.saturating_sub(by)..=(c + by).min(PIXELS - 1);
-        let behind = range + BEHIND;
-        let free = around(u, window).all(|u| around(v, window).all(|v| self.nearest[position(face, u, v)] >= behind));
-        free && around(u, 1).any(|u| around(v, 1).any(|v| self.seen[position(face, u, v)]))
+        let free = |row: &[f32]| row.iter().fold(true, |free, nearest| free & (*nearest >= behind));
+        around(u, window).all(|u| free(&self.nearest[position(face, u, 0)..][around(v, window)]))
     }
 
     /// Face, pixel and range of a place; `None` at the viewpoint itself.
@@ -81,6 +92,11 @@ impl View {
         let pixel = |x: f64| ((((x / depth + 1.0) / 2.0) * PIXELS as f64) as usize).min(PIXELS - 1);
         Some((face, pixel(offset[(axis + 1) % 3]), pixel(offset[(axis + 2) % 3]), offset.norm() as f32))
     }
+}
+
+/// Pixels at most `by` from `c`, within the face.
+fn around(c: usize, by: usize) -> RangeInclusive<usize> {
+    c.saturating_sub(by)..=(c + by).min(PIXELS - 1)
 }
 
 fn position(face: usize, u: usize, v: usize) -> usize {
