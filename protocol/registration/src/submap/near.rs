@@ -2,6 +2,7 @@
 //! cells of a dense table, in the order in which they are looked through. Lengths are in voxels.
 
 use super::grid::bounds;
+use core::ops::ControlFlow;
 
 /// Edge of a cell: of a thinned wall each holds a handful of points.
 const EDGE: f32 = 2.0;
@@ -66,13 +67,16 @@ impl Near {
     /// The piece nearest to `at` within `radius` of those that `fit`; of several, the first sorted in.
     pub fn nearest(&self, at: &[f32; 3], radius: f32, fits: impl Fn(&Piece) -> bool) -> Option<&Piece> {
         let mut best = (radius * radius, None);
-        for piece in self.rows(at, radius).flatten() {
-            let squared = piece.squared(at);
-            let nearer = squared < best.0 || (squared == best.0 && best.1.is_none());
-            if nearer && fits(piece) {
-                best = (squared, Some(piece));
+        let _ = self.rows(at, radius, |row| {
+            for piece in row {
+                let squared = piece.squared(at);
+                let nearer = squared < best.0 || (squared == best.0 && best.1.is_none());
+                if nearer && fits(piece) {
+                    best = (squared, Some(piece));
+                }
             }
-        }
+            ControlFlow::Continue(())
+        });
         best.1
     }
 
@@ -80,30 +84,43 @@ impl Near {
     /// enough.
     pub fn any(&self, at: &[f32; 3], radius: f32, fits: impl Fn(&Piece) -> bool) -> bool {
         let here = |piece: &Piece| piece.squared(at) <= radius * radius && fits(piece);
-        self.rows(at, radius).any(|row| row.iter().any(here))
+        let found =
+            |row: &[Piece]| if row.iter().any(here) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
+        self.rows(at, radius, found).is_break()
     }
 
     /// Shows every piece within `radius` of `at`.
-    pub fn within(&self, at: &[f32; 3], radius: f32, each: impl FnMut(&Piece)) {
-        let pieces = self.rows(at, radius).flatten();
-        pieces.filter(|piece| piece.squared(at) <= radius * radius).for_each(each);
+    pub fn within(&self, at: &[f32; 3], radius: f32, mut each: impl FnMut(&Piece)) {
+        let _ = self.rows(at, radius, |row| {
+            row.iter().filter(|piece| piece.squared(at) <= radius * radius).for_each(&mut each);
+            ControlFlow::Continue(())
+        });
     }
 
-    /// The pieces of every cell within `radius` of `at`, row by row of cells.
-    fn rows(&self, at: &[f32; 3], radius: f32) -> impl Iterator<Item = &[Piece]> {
+    /// Shows the pieces of every cell within `radius` of `at`, row by row of cells, until it is enough.
+    #[inline]
+    fn rows<'a>(
+        &'a self,
+        at: &[f32; 3],
+        radius: f32,
+        mut each: impl FnMut(&'a [Piece]) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
         let mut run = [(0, 0); 3];
         for k in 0..3 {
             let (from, to) = (self.cell(at[k] - radius, k).max(0), self.cell(at[k] + radius, k));
             let to = to.min(self.dims[k] as i64 - 1);
-            // Past the end of this axis, or of a table of nothing: no row.
-            run[k] = if from > to { (1, 0) } else { (from as usize, to as usize) };
+            if from > to {
+                return ControlFlow::Continue(());
+            }
+            run[k] = (from as usize, to as usize);
         }
-        let [x, y, z] = run.map(|(from, to)| from..to + 1);
-        let rows = if z.is_empty() { 0..0 } else { x };
-        rows.flat_map(move |x| y.clone().map(move |y| (x, y))).map(move |(x, y)| {
-            let (first, last) = (self.position(x, y, z.start), self.position(x, y, z.end - 1));
-            &self.pieces[self.starts[first] as usize..self.starts[last + 1] as usize]
-        })
+        for x in run[0].0..=run[0].1 {
+            for y in run[1].0..=run[1].1 {
+                let (first, last) = (self.position(x, y, run[2].0), self.position(x, y, run[2].1));
+                each(&self.pieces[self.starts[first] as usize..self.starts[last + 1] as usize])?;
+            }
+        }
+        ControlFlow::Continue(())
     }
 
     /// The cell of a coordinate, which may lie outside of the table: just before it counts as the first. Saturates.

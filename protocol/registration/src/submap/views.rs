@@ -41,8 +41,9 @@ impl Views {
             };
             let mut seen = vec![false; view.seen.len()];
             for (p, &by) in points.iter().zip(mine.seen_from()) {
-                let Some((face, u, v, range)) = view.pixel(&Vector3::from(p.map(f64::from))) else { continue };
-                let at = position(face, u, v);
+                let offset = Vector3::from(p.map(f64::from)) - view.from;
+                let Some((face, u, v)) = pixel(&offset) else { continue };
+                let (at, range) = (position(face, u, v), offset.norm() as f32);
                 view.nearest[at] = view.nearest[at].min(range);
                 if usize::from(by) == k && !seen[at] {
                     seen[at] = true;
@@ -64,11 +65,16 @@ impl Views {
 
 impl View {
     fn looked_through(&self, at: &Vector3<f64>) -> bool {
-        let Some((face, u, v, range)) = self.pixel(at) else { return false };
-        let behind = range + BEHIND;
-        let middle = position(face, u, v);
+        let offset = at - self.from;
+        let Some((face, u, v)) = pixel(&offset) else { return false };
         // Most places lie where this keyframe saw nothing, or something nearer.
-        if !self.seen[middle] || self.nearest[middle] < behind {
+        let middle = position(face, u, v);
+        if !self.seen[middle] {
+            return false;
+        }
+        let range = offset.norm() as f32;
+        let behind = range + BEHIND;
+        if self.nearest[middle] < behind {
             return false;
         }
         // A pixel in the middle of a face is 2 / PIXELS wide at unit distance.
@@ -79,19 +85,18 @@ impl View {
         let free = |row: &[f32]| row.iter().fold(true, |free, nearest| free & (*nearest >= behind));
         around(u, window).all(|u| free(&self.nearest[position(face, u, 0)..][around(v, window)]))
     }
+}
 
-    /// Face, pixel and range of a place; `None` at the viewpoint itself.
-    fn pixel(&self, at: &Vector3<f64>) -> Option<(usize, usize, usize, f32)> {
-        let offset = at - self.from;
-        let axis = offset.iamax();
-        let depth = offset[axis].abs();
-        if depth.is_nan() || depth <= 1e-6 {
-            return None;
-        }
-        let face = 2 * axis + usize::from(offset[axis] < 0.0);
-        let pixel = |x: f64| ((((x / depth + 1.0) / 2.0) * PIXELS as f64) as usize).min(PIXELS - 1);
-        Some((face, pixel(offset[(axis + 1) % 3]), pixel(offset[(axis + 2) % 3]), offset.norm() as f32))
+/// Face and pixel of a place, as seen from the viewpoint; `None` at the viewpoint itself.
+fn pixel(offset: &Vector3<f64>) -> Option<(usize, usize, usize)> {
+    let axis = offset.iamax();
+    let depth = offset[axis].abs();
+    if depth.is_nan() || depth <= 1e-6 {
+        return None;
     }
+    let face = 2 * axis + usize::from(offset[axis] < 0.0);
+    let along = |x: f64| ((((x / depth + 1.0) / 2.0) * PIXELS as f64) as usize).min(PIXELS - 1);
+    Some((face, along(offset[(axis + 1) % 3]), along(offset[(axis + 2) % 3])))
 }
 
 /// Pixels at most `by` from `c`, within the face.
