@@ -231,10 +231,10 @@ pub enum Problem {
     Image(String),
     /// A bag cannot be read.
     #[error("{0}")]
-    Bag(BagProblem),
+    Bag(Box<BagProblem>),
     /// Clouds and poses of a bag do not come together.
     #[error("{0}")]
-    Join(JoinError),
+    Join(Box<JoinError>),
     /// A folder holds nothing that can be fed to robots.
     #[error("{0}")]
     Data(String),
@@ -256,7 +256,7 @@ impl From<BagError> for RecordingError {
     fn from(BagError { path, problem }: BagError) -> Self {
         match problem {
             BagProblem::Io(error) => Problem::Io(error).of(path),
-            problem => Problem::Bag(problem).of(path),
+            problem => Problem::Bag(Box::new(problem)).of(path),
         }
     }
 }

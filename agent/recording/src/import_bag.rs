@@ -99,7 +99,7 @@ fn about(bag: &Bag, told: &str) -> String {
 fn of_bag(bag: &Bag, error: JoinError) -> RecordingError {
     match error {
         JoinError::Bag(error) => error.into(),
-        error => Problem::Join(error).of(bag.path()),
+        error => Problem::Join(Box::new(error)).of(bag.path()),
     }
 }
 

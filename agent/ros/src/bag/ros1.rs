@@ -68,8 +68,11 @@ pub(super) fn scan(
 
 type Fields<'a> = BTreeMap<&'a [u8], &'a [u8]>;
 
-/// The next record of the file: header and data; the inner error tells why there is none though the file goes on.
-fn record(file: &mut impl Read) -> std::io::Result<Result<Option<(Vec<u8>, Vec<u8>)>, String>> {
+/// Header and data of a record, `None` at the end of the file, or why there is none before it.
+type Next = Result<Option<(Vec<u8>, Vec<u8>)>, String>;
+
+/// The next record of the file; the inner error tells why there is none though the file goes on.
+fn record(file: &mut impl Read) -> std::io::Result<Next> {
     let header = match part(file, RECORD_HEADER_BYTES_MAX)? {
         Part::Whole(header) => header,
         Part::End => return Ok(Ok(None)),

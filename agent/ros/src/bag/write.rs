@@ -5,18 +5,10 @@ use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
-/// A message to be written, or read.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Written {
-    /// Its topic.
-    pub topic: String,
-    /// Its type.
-    pub kind: String,
-    /// When it was received, ns.
-    pub received_ns: i64,
-    /// It.
-    pub bytes: Vec<u8>,
-}
+#[path = "write_ros1.rs"]
+mod write_ros1;
+
+pub use write_ros1::Written;
 
 /// An MCAP file, in chunks of a few messages or without chunks.
 pub fn mcap(path: &Path, messages: &[Written], by: Option<mcap::Compression>, chunks: bool, encoding: &str) {
@@ -80,63 +72,20 @@ pub fn db3(path: &Path, messages: &[Written], defined: bool, packed: bool) {
     transaction.commit().unwrap();
 }
 
-/// A ROS 1 bag, in chunks of ten messages, without an index.
+/// A ROS 1 bag.
 pub fn ros1(path: &Path, messages: &[Written], by: &str) {
-    let mut bag = b"#ROSBAG V2.0\n".to_vec();
-    let zero = 0_u64.to_le_bytes();
-    bag.extend(record(
-        &[("op", &[3]), ("index_pos", &zero), ("conn_count", &zero[..4]), ("chunk_count", &zero[..4])],
-        &[b' '; 100],
-    ));
-    let mut connections = BTreeMap::new();
-    for part in messages.chunks(10) {
-        let mut records = Vec::new();
-        for message in part {
-            let next = connections.len() as u32;
-            let connection = *connections.entry(&message.topic).or_insert_with(|| {
-                let head = [("op", &[7][..]), ("conn", &next.to_le_bytes()), ("topic", message.topic.as_bytes())];
-                let data = fields(&[
-                    ("topic", message.topic.as_bytes()),
-                    ("type", message.kind.as_bytes()),
-                    ("md5sum", b"*"),
-                    ("message_definition", b"# left out"),
-                ]);
-                records.extend(record(&head, &data));
-                next
-            });
-            let (secs, nanos) = (message.received_ns / 1_000_000_000, message.received_ns % 1_000_000_000);
-            let time = [(secs as u32).to_le_bytes(), (nanos as u32).to_le_bytes()].concat();
-            let head = [("op", &[2][..]), ("conn", &connection.to_le_bytes()), ("time", &time)];
-            records.extend(record(&head, &message.bytes));
+    let pack = |records: &[u8]| match by {
+        "bz2" => {
+            let mut encoder = bzip2::write::BzEncoder::new(Vec::new(), bzip2::Compression::fast());
+            encoder.write_all(records).unwrap();
+            encoder.finish().unwrap()
         }
-        let packed = match by {
-            "bz2" => {
-                let mut encoder = bzip2::write::BzEncoder::new(Vec::new(), bzip2::Compression::fast());
-                encoder.write_all(&records).unwrap();
-                encoder.finish().unwrap()
-            }
-            "lz4" => {
-                let mut encoder = lz4::EncoderBuilder::new().build(Vec::new()).unwrap();
-                encoder.write_all(&records).unwrap();
-                encoder.finish().0
-            }
-            _ => records.clone(),
-        };
-        let size = (records.len() as u32).to_le_bytes();
-        bag.extend(record(&[("op", &[5]), ("compression", by.as_bytes()), ("size", &size)], &packed));
-    }
-    fs::write(path, bag).unwrap();
-}
-
-fn fields(fields: &[(&str, &[u8])]) -> Vec<u8> {
-    let field = |(name, value): &(&str, &[u8])| {
-        let field = [name.as_bytes(), b"=", value].concat();
-        [&(field.len() as u32).to_le_bytes()[..], &field].concat()
+        "lz4" => {
+            let mut encoder = lz4::EncoderBuilder::new().build(Vec::new()).unwrap();
+            encoder.write_all(records).unwrap();
+            encoder.finish().0
+        }
+        _ => records.to_vec(),
     };
-    fields.iter().flat_map(field).collect()
-}
-
-fn record(head: &[(&str, &[u8])], data: &[u8]) -> Vec<u8> {
-    let head = fields(head);
-    [&(head.len() as u32).to_le_bytes()[..], &head, &(data.len() as u32).to_le_bytes(), data].concat()
+    fs::write(path, write_ros1::bag(messages, by, pack)).unwrap();
 }

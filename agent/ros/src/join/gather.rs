@@ -61,6 +61,9 @@ pub struct Joined {
 /// A pose, and the number of its covariance.
 type Sample = (Se3, Option<usize>);
 
+/// Poses in rising order of their stamps, with the frames of odometry and body, and where they come from.
+type Way = (Vec<(i64, Sample)>, String, String, String);
+
 /// What is read of one robot.
 struct Gathering<'a> {
     choice: &'a Choice,
@@ -231,7 +234,7 @@ impl<'a> Gathering<'a> {
     }
 
     /// Poses of TF `odom → base_link`, with frames and where they come from.
-    fn of_tf(&self) -> Option<(Vec<(i64, Sample)>, String, String, String)> {
+    fn of_tf(&self) -> Option<Way> {
         let named = |frame: &str, name: &str| frame == name || frame.ends_with(&format!("/{name}"));
         let links = |body: &str| -> Vec<(String, String)> {
             let links = self.tree.links().filter(|(odom, child)| named(odom, ODOM) && named(child, body));
