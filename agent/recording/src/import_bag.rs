@@ -37,6 +37,11 @@ const WAY: (f64, f64) = (0.05, 0.01);
 /// ...and of rotation, rad, per metre and per rad turned and so much besides.
 const ROTATION: (f64, f64, f64) = (0.01, 0.05, 0.002);
 
+/// Submaps that a robot should have at least, so that three alignments can be found...
+const SUBMAPS_PER_ROBOT: f64 = 4.0;
+/// ...of so many keyframes each.
+const KEYFRAMES_MIN: f64 = 4.0;
+
 /// What is to become of a bag of one robot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Single {
@@ -156,6 +161,19 @@ impl Profile {
         config.submap.distance_m = 10.0;
         Self { sensor: "lidar3d", config, step: LIDAR_STEP, covariance: moved }
     }
+
+    /// Makes submaps so short that a robot that goes so far, m, has enough of them.
+    fn shortened(mut self, way: f64) -> Self {
+        let least = KEYFRAMES_MIN * self.step.0;
+        let distance = &mut self.config.submap.distance_m;
+        *distance = distance.min((way / SUBMAPS_PER_ROBOT).max(least));
+        self
+    }
+}
+
+/// How far the body went, m.
+fn way(clouds: &[Posed]) -> f64 {
+    clouds.windows(2).map(|two| (two[1].pose.translation - two[0].pose.translation).norm()).sum()
 }
 
 fn moved(motion: &Se3) -> Result<Covariance<6>, CovarianceError> {
@@ -210,7 +228,7 @@ impl Source<'_> {
             let why = format!("holds {} clouds with a pose; {robots} robots need at least one each", clouds.len());
             return Err(Problem::Data(why).of(self.bag.path()));
         }
-        let profile = self.profile()?;
+        let profile = self.profile()?.shortened(way(clouds) / robots as f64);
         let dealt: Deal = deal(clouds.iter().map(|posed| &posed.pose), robots);
         let begin = |(robot, name): (usize, &&str)| {
             Recorder::begin(self, &profile, out, name, format!("; {}", dealt.how(robot)), dealt.of(robot))
