@@ -2,9 +2,9 @@
 //! by their sums before anything of them is used.
 
 use super::{BagError, BagProblem, CHUNK_BYTES_MAX, Damage, Flow, MESSAGE_BYTES_MAX, Record, Topics};
-use crate::wire::Serialization;
+use crate::wire::{Field as _, Ros1Reader, Serialization, Source as _};
 use mcap::McapError;
-use mcap::records::{Record as Parsed, op};
+use mcap::records::op;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -82,31 +82,41 @@ impl Known {
         topics: &mut Topics,
         damage: &mut Damage,
     ) -> Result<Option<Record<'a>>, Refusal> {
-        // Nothing else is parsed: attachments may be long, and of indices we have no need.
-        if !matches!(opcode, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
-            return Ok(None);
-        }
-        match mcap::parse_record(opcode, data).map_err(|_| Refusal::Record)? {
-            Parsed::Schema { header, .. } => drop(self.schemas.insert(header.id, header.name)),
-            Parsed::Channel(channel) => {
-                let kind = self.schemas.get(&channel.schema_id).map_or("", String::as_str);
-                let serialization = match channel.message_encoding.as_str() {
+        // Nothing else is parsed: attachments may be long, and of indices we have no need. The crate's own parser takes
+        // memory for any length that a text claims, up to 4 GB; ROS 1 writes numbers and texts alike.
+        let mut fields = Ros1Reader::new(data);
+        let number = |fields: &mut Ros1Reader<'_>| fields.u16("id").map_err(|_| Refusal::Record);
+        let text = |fields: &mut Ros1Reader<'_>| String::read(fields, "text").map_err(|_| Refusal::Record);
+        match opcode {
+            op::SCHEMA => {
+                let id = number(&mut fields)?;
+                self.schemas.insert(id, text(&mut fields)?);
+            }
+            op::CHANNEL => {
+                let (id, schema) = (number(&mut fields)?, number(&mut fields)?);
+                let (topic, encoding) = (text(&mut fields)?, text(&mut fields)?);
+                let kind = self.schemas.get(&schema).map_or("", String::as_str);
+                let serialization = match encoding.as_str() {
                     "cdr" => Some(Serialization::Cdr),
                     "ros1" => Some(Serialization::Ros1),
                     _ => None,
                 };
-                let index = topics.index(&channel.topic, kind, serialization).map_err(Refusal::Bag)?;
-                self.channels.insert(channel.id, index);
+                let index = topics.index(&topic, kind, serialization).map_err(Refusal::Bag)?;
+                self.channels.insert(id, index);
             }
-            Parsed::Message { header, .. } => {
-                let topic = *self.channels.get(&header.channel_id).ok_or(Refusal::Record)?;
-                // The body is borrowed from the chunk, so that a cloud is not copied.
-                let bytes = data.get(MESSAGE_HEADER_LEN..).ok_or(Refusal::Record)?;
-                if bytes.len() > MESSAGE_BYTES_MAX {
+            op::MESSAGE => {
+                let channel = number(&mut fields)?;
+                let topic = *self.channels.get(&channel).ok_or(Refusal::Record)?;
+                fields.u32("sequence").map_err(|_| Refusal::Record)?;
+                let received = fields.u64("log_time").map_err(|_| Refusal::Record)?;
+                fields.u64("publish_time").map_err(|_| Refusal::Record)?;
+                let left = fields.left();
+                if left > MESSAGE_BYTES_MAX {
                     damage.long += 1;
                     return Ok(None);
                 }
-                let received_ns = i64::try_from(header.log_time).unwrap_or(i64::MAX);
+                let bytes = fields.raw("data", left).map_err(|_| Refusal::Record)?;
+                let received_ns = i64::try_from(received).unwrap_or(i64::MAX);
                 return Ok(Some(Record { topic, received_ns, bytes }));
             }
             _ => {}
@@ -114,6 +124,3 @@ impl Known {
         Ok(None)
     }
 }
-
-/// Channel, sequence, log time and publish time of a message.
-const MESSAGE_HEADER_LEN: usize = 2 + 4 + 8 + 8;
