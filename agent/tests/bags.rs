@@ -1,4 +1,5 @@
-//! ROS bags by the program: what `doctor`, `run` and `demo` make of them, and what they say of those that are not clear.
+//! ROS bags by the program: what `doctor`, `run` and `demo` make of them, and what they say of those that are not
+//! clear.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod common;

@@ -1,5 +1,5 @@
-//! Bags of simulated drives become recordings: a robot each, several in one, or one cut into three. What they hold lies on
-//! the walls of the room; covariances are those that the odometry states.
+//! Bags of simulated drives become recordings: a robot each, several in one, or one cut into three. What they hold
+//! lies on the walls of the room; covariances are those that the odometry states.
 
 #[path = "../../ros/src/join/drive.rs"]
 mod drive;

@@ -1,6 +1,6 @@
-//! One robot's way becomes that of several, as if each had driven a stretch of it. The stretches overlap, and two robots
-//! never hold the same scan: of a way with many scans to a metre each robot is given every third (of three robots), of any
-//! other all of its stretch, alternately where another robot drives, too.
+//! One robot's way becomes that of several, as if each had driven a stretch of it. The stretches overlap, and two
+//! robots never hold the same scan: of a way with many scans to a metre each robot is given every third (of three
+//! robots), of any other all of its stretch, alternately where another robot drives, too.
 
 use core::ops::Range;
 use merganser_protocol::geometry::Se3;

@@ -1,8 +1,7 @@
-//! Whatever lies in a folder becomes recordings, one per robot: a folder of recordings as it is; 7-Scenes RGB-D frames
-//! and LiDAR scans cut into robots by time; a planar laser's log, or a ROS bag of one robot, cut into robots with its real
-//! odometry; ROS bags of several robots. A robot cut
-//! from frames or scans has a local frame of its own (its first body pose) and a seeded drift on its true motion, and
-//! its manifest says so.
+//! Whatever lies in a folder becomes recordings, one per robot: a folder of recordings as it is; 7-Scenes RGB-D
+//! frames and LiDAR scans cut into robots by time; a planar laser's log, or a ROS bag of one robot, cut into robots
+//! with its real odometry; ROS bags of several robots. A robot cut from frames or scans has a local frame of its own
+//! (its first body pose) and a seeded drift on its true motion, and its manifest says so.
 
 use super::cut::NAMES;
 use super::error::{Problem, RecordingError, on};

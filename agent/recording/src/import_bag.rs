@@ -1,6 +1,6 @@
-//! ROS bags become recordings: a bag each, or robots in one bag by the first part of their topics' names; a bag of one robot
-//! alone is cut into three by time, as a laser's log is, or left whole. Keyframes are chosen by motion. Covariances are those
-//! that the odometry states, where it states any.
+//! ROS bags become recordings: a bag each, or robots in one bag by the first part of their topics' names; a bag of
+//! one robot alone is cut into three by time, as a laser's log is, or left whole. Keyframes are chosen by motion.
+//! Covariances are those that the odometry states, where it states any.
 
 use super::Writer;
 use super::carmen::{STEP_M, STEP_RAD, driven};

@@ -1,5 +1,5 @@
-//! Prints what is read of a bag, a line for each message, to be compared with another reader: topic, time of receipt, and, of
-//! odometry, scans, clouds and transforms, stamp, frame and numbers (poses; how many points, and their sum).
+//! Prints what is read of a bag, a line for each message, to be compared with another reader: topic, time of receipt,
+//! and, of odometry, scans, clouds and transforms, stamp, frame and numbers (poses; how many points, and their sum).
 //!
 //! ```sh
 //! cargo run --release -p merganser-ros --example dump_bag -- BAG

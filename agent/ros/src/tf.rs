@@ -1,10 +1,10 @@
-//! The tree of transforms: which frame lies how in which, over time. Between two stamps a transform is interpolated (along
-//! the screw from one to the other: slerp of the rotation); before the first and after the last there is none, unless it
-//! never changed, as a robot_state_publisher of old sends fixed joints on `/tf`.
+//! The tree of transforms: which frame lies how in which, over time. Between two stamps a transform is interpolated
+//! (along the screw from one to the other: slerp of the rotation); before the first and after the last there is none,
+//! unless it never changed, as a robot_state_publisher of old sends fixed joints on `/tf`.
 //!
-//! A frame may be said to lie in several others (wheels' drivers publish `odom → base_link` and `odom → base_footprint`
-//! beside `base_link → base_footprint`): the shortest way between two frames is taken. A loop, in which a frame would lie in
-//! itself, is refused link by link.
+//! A frame may be said to lie in several others (wheels' drivers publish `odom → base_link` and `odom →
+//! base_footprint` beside `base_link → base_footprint`): the shortest way between two frames is taken. A loop, in
+//! which a frame would lie in itself, is refused link by link.
 
 use crate::limits::{CHAIN_MAX, FRAMES_MAX, GAP_SECS_MAX, LATE_MAX, TRANSFORMS_MAX};
 use crate::msg::{TfMessage, TransformStamped, plain_frame};

@@ -41,8 +41,8 @@ fn largest(work: impl FnOnce()) -> usize {
     LARGEST.get()
 }
 
-/// Bytes of memory for each byte of a message, and besides: a point of three doubles may come of three bytes, an element of
-/// a list with its text of a dozen.
+/// Bytes of memory for each byte of a message, and besides: a point of three doubles may come of three bytes, an
+/// element of a list with its text of a dozen.
 const PER_BYTE: usize = 32;
 const BESIDES: usize = 4_096;
 

@@ -7,8 +7,8 @@ use anyhow::Result;
 /// Options that name topics.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct Topics {
-    /// Of a ROS bag: the topic of poses (nav_msgs/Odometry, PoseStamped, PoseWithCovarianceStamped). Without a leading slash
-    /// it is that of each robot's namespace.
+    /// Of a ROS bag: the topic of poses (nav_msgs/Odometry, PoseStamped, PoseWithCovarianceStamped). Without a
+    /// leading slash it is that of each robot's namespace.
     #[arg(long, value_name = "TOPIC")]
     pub odometry: Option<String>,
     /// Of a ROS bag: the topic of clouds (sensor_msgs/PointCloud2, LaserScan), named alike.

@@ -131,8 +131,8 @@ fn number(file: &Path) -> Option<u64> {
     file.file_stem()?.to_str()?.rsplit('_').next()?.parse().ok()
 }
 
-/// The files that `metadata.yaml` names, a line each: `relative_file_paths:` and then `- NAME`. All else that it says stands
-/// in the files, too.
+/// The files that `metadata.yaml` names, a line each: `relative_file_paths:` and then `- NAME`. All else that it says
+/// stands in the files, too.
 fn names(metadata: &Path) -> Result<Vec<String>, BagError> {
     let told = |error: std::io::Error| BagProblem::Io(error).of(metadata);
     let mut text = Vec::new();

@@ -1,5 +1,5 @@
-//! MCAP, by the `mcap` crate's reader from front to back, which needs no index: chunks (zstd, lz4, unpacked) are checked
-//! by their sums before anything of them is used.
+//! MCAP, by the `mcap` crate's reader from front to back, which needs no index: chunks (zstd, lz4, unpacked) are
+//! checked by their sums before anything of them is used.
 
 use super::{BagError, BagProblem, CHUNK_BYTES_MAX, Damage, Flow, MESSAGE_BYTES_MAX, Record, Topics};
 use crate::wire::{Field as _, Ros1Reader, Serialization, Source as _};

@@ -1,7 +1,9 @@
-//! Bags: recordings of ROS topics, as MCAP, as ROS 2's sqlite3 files, and of ROS 1 (format 2.0). All give the same: topics
-//! with their types, and messages one by one in the order of the file, of which no more than one chunk is in memory.
+//! Bags: recordings of ROS topics, as MCAP, as ROS 2's sqlite3 files, and of ROS 1 (format 2.0). All give the same:
+//! topics with their types, and messages one by one in the order of the file, of which no more than one chunk is in
+//! memory.
 //!
-//! A bag that was cut short, as by a robot that lost power, is read as far as it is whole, and [`Bag::damage`] tells so.
+//! A bag that was cut short, as by a robot that lost power, is read as far as it is whole, and [`Bag::damage`] tells
+//! so.
 
 mod files;
 mod mcap;
@@ -135,7 +137,8 @@ pub struct Bag {
 }
 
 impl Bag {
-    /// Opens the bag at `path`, a file or a folder with `metadata.yaml`, and counts its messages, for which it is read once.
+    /// Opens the bag at `path`, a file or a folder with `metadata.yaml`, and counts its messages, for which it is
+    /// read once.
     ///
     /// # Errors
     /// [`BagError`].

@@ -1,6 +1,7 @@
-//! ROS 1 bags of format 2.0, from front to back, without their index: so one that was cut, or never closed, is read as
-//! far as it goes. Records are a header of fields `name=value` and data; messages and connections stand in chunks (`none`,
-//! `bz2`, `lz4`). A reader of our own: the one crate there is (`rosbag` 0.6) trusts offsets and lengths in the file.
+//! ROS 1 bags of format 2.0, from front to back, without their index: so one that was cut, or never closed, is read
+//! as far as it goes. Records are a header of fields `name=value` and data; messages and connections stand in chunks
+//! (`none`, `bz2`, `lz4`). A reader of our own: the one crate there is (`rosbag` 0.6) trusts offsets and lengths in
+//! the file.
 
 use super::{
     BagError, BagProblem, CHUNK_BYTES_MAX, Damage, Flow, MESSAGE_BYTES_MAX, RECORD_HEADER_BYTES_MAX, Record, Topics,
@@ -198,7 +199,8 @@ impl Reader<'_> {
         let connection = number(&head, b"conn").map(u32::from_le_bytes);
         match (operation(header), connection) {
             (Some(CONNECTION), Some(connection)) => {
-                // The topic in the header is the one under which it was stored, the one in the data that of the publisher.
+                // The topic in the header is the one under which it was stored, the one in the data that of the
+                // publisher.
                 let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
                 let name = text(head.get(&b"topic"[..]).copied().unwrap_or_default());
                 let kind = text(fields(data).get(&b"type"[..]).copied().unwrap_or_default());

@@ -1,5 +1,5 @@
-//! ROS 2's sqlite3 files, by SQLite itself: tables `topics` and `messages`. Type definitions, which later versions write,
-//! are not needed. Messages that were packed one by one (zstd) are unpacked.
+//! ROS 2's sqlite3 files, by SQLite itself: tables `topics` and `messages`. Type definitions, which later versions
+//! write, are not needed. Messages that were packed one by one (zstd) are unpacked.
 
 use super::{BagError, BagProblem, Damage, Flow, MESSAGE_BYTES_MAX, Record, Topics};
 use crate::wire::Serialization;

@@ -1,5 +1,5 @@
-//! Small bags of each kind are written and read back equal; damaged ones are read as far as they are whole, or refused by
-//! name; arbitrary bytes are no danger.
+//! Small bags of each kind are written and read back equal; damaged ones are read as far as they are whole, or
+//! refused by name; arbitrary bytes are no danger.
 
 use super::write::{Written, db3, mcap, ros1};
 use super::{Bag, BagError, BagProblem, Flow, Topic};

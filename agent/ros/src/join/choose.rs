@@ -1,6 +1,6 @@
-//! Which topics of a bag are whose. One robot has one odometry and one cloud; several robots in one bag are told by the first
-//! part of their topics' names (`/robot1/odom`, `/robot1/scan`). What is not clear is an error that lists the topics and
-//! names the option that decides.
+//! Which topics of a bag are whose. One robot has one odometry and one cloud; several robots in one bag are told by
+//! the first part of their topics' names (`/robot1/odom`, `/robot1/scan`). What is not clear is an error that lists
+//! the topics and names the option that decides.
 
 use super::{JoinError, listed};
 use crate::bag::Topic;
@@ -11,8 +11,8 @@ use std::collections::BTreeMap;
 /// What somebody asked for.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Wanted {
-    /// Topic of poses: `nav_msgs/Odometry`, `geometry_msgs/PoseStamped` or `PoseWithCovarianceStamped`. Without a leading
-    /// slash it is that of each namespace.
+    /// Topic of poses: `nav_msgs/Odometry`, `geometry_msgs/PoseStamped` or `PoseWithCovarianceStamped`. Without a
+    /// leading slash it is that of each namespace.
     pub odometry: Option<String>,
     /// Topic of `sensor_msgs/PointCloud2` or `LaserScan`, named alike.
     pub cloud: Option<String>,

@@ -1,5 +1,5 @@
-//! A simulated drive, as messages of a bag, for tests: a robot on a circle in a rectangular room, with odometry at 20 Hz and a
-//! planar laser, or a LiDAR that sees the walls' height, at 10 Hz.
+//! A simulated drive, as messages of a bag, for tests: a robot on a circle in a rectangular room, with odometry at 20
+//! Hz and a planar laser, or a LiDAR that sees the walls' height, at 10 Hz.
 
 use super::geometry::{Se3, So3};
 use super::ros::msg::{

@@ -49,7 +49,8 @@ pub struct Joined {
     pub body: String,
     /// Clouds with a pose, with rising numbers and stamps; at least one.
     pub clouds: Vec<Posed>,
-    /// Covariances of poses as stated: 6×6 row by row, x, y, z and rotation about the fixed axes of the odometry's frame.
+    /// Covariances of poses as stated: 6×6 row by row, x, y, z and rotation about the fixed axes of the odometry's
+    /// frame.
     pub covariances: Vec<[f64; 36]>,
     /// Transforms.
     pub tree: TfTree,
@@ -212,11 +213,11 @@ impl<'a> Gathering<'a> {
             })?,
         };
         for (why, count) in self.poses_bad.reasons() {
-            (0..count).for_each(|_| self.tally.count(format!("{told}: {why}")));
+            self.tally.add(format!("{told}: {why}"), count);
         }
         let clouds = self.posed(&poses, &topic.name, &told)?;
         for (why, count) in self.tree.refused() {
-            (0..*count).for_each(|_| self.tally.count(format!("TF: {why}")));
+            self.tally.add(format!("TF: {why}"), *count);
         }
         Ok(Joined {
             choice: self.choice.clone(),
@@ -257,7 +258,7 @@ impl<'a> Gathering<'a> {
             return Err(JoinError::Unusable { topic: name.into(), count: count as u64, why });
         }
         for (why, bad) in self.clouds_bad.reasons() {
-            (0..bad).for_each(|_| self.tally.count(format!("{name}: {why}")));
+            self.tally.add(format!("{name}: {why}"), bad);
         }
         let is_clockless = read.iter().all(|stamp| *stamp == 0);
         let (mut clouds, mut last) = (Vec::new(), i64::MIN);
@@ -333,7 +334,9 @@ fn stamped(poses: Vec<(i64, i64, Sample)>, name: &str, tally: &mut Tally) -> Vec
     samples.sort_by_key(|(stamp, _)| *stamp);
     let all = samples.len();
     samples.dedup_by_key(|(stamp, _)| *stamp);
-    (samples.len()..all).for_each(|_| tally.count(format!("{name}: left out, as another has the same stamp")));
+    if samples.len() < all {
+        tally.add(format!("{name}: left out, as another has the same stamp"), (all - samples.len()) as u64);
+    }
     samples
 }
 

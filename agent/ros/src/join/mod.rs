@@ -1,6 +1,6 @@
-//! Clouds joined with poses: which topics are the odometry and the cloud of which robot ([`choose`]), where the body was when
-//! a cloud was measured, and the cloud's points in the body's frame. Stamps are those of the headers; poses are interpolated
-//! between two stamps, never beyond them.
+//! Clouds joined with poses: which topics are the odometry and the cloud of which robot ([`choose`]), where the body
+//! was when a cloud was measured, and the cloud's points in the body's frame. Stamps are those of the headers; poses
+//! are interpolated between two stamps, never beyond them.
 //!
 //! A bag is read once for poses, transforms and stamps ([`gather`]), then once more for the clouds that are wanted
 //! ([`Joined::read`]).
@@ -158,12 +158,17 @@ pub struct Tally {
 
 impl Tally {
     /// Reasons that are told apart; they may hold what a file says.
-    const REASONS_MAX: usize = 32;
+    const REASONS_MAX: usize = 12;
     /// Characters of a reason at most.
     const REASON_LEN_MAX: usize = 400;
 
     /// Takes one down.
     pub fn count(&mut self, reason: impl std::fmt::Display) {
+        self.add(reason, 1);
+    }
+
+    /// Takes so many down.
+    pub fn add(&mut self, reason: impl std::fmt::Display, count: u64) {
         let mut reason = reason.to_string();
         if let Some((end, _)) = reason.char_indices().nth(Self::REASON_LEN_MAX) {
             reason.truncate(end);
@@ -171,7 +176,7 @@ impl Tally {
         if self.reasons.len() >= Self::REASONS_MAX && !self.reasons.contains_key(&reason) {
             reason = "for other reasons".into();
         }
-        *self.reasons.entry(reason).or_default() += 1;
+        *self.reasons.entry(reason).or_default() += count;
     }
 
     /// The commonest reason.

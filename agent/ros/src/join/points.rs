@@ -2,8 +2,9 @@
 
 use super::{JoinError, Joined, Posed, Tally};
 use crate::bag::{Bag, Flow};
-use crate::limits::POINTS_KEPT_MAX;
+use crate::limits::{GAP_SECS_MAX, POINTS_KEPT_MAX};
 use crate::msg::{Header, LaserScan, PointCloud2};
+use crate::tf::TfError;
 use crate::wire::Message as _;
 use merganser_geometry::Se3;
 use nalgebra::Vector3;
@@ -18,9 +19,9 @@ pub struct Placed {
 }
 
 impl Joined {
-    /// Reads the clouds for which `wanted` says so, by their place in [`Joined::clouds`], and gives them to `each` in their
-    /// order. Clouds that have no point, cannot be read, or whose frame has no transform then, are counted in what is
-    /// returned. It may stop the reading.
+    /// Reads the clouds for which `wanted` says so, by their place in [`Joined::clouds`], and gives them to `each` in
+    /// their order. Clouds that have no point, cannot be read, or whose frame has no transform then, are counted in
+    /// what is returned. It may stop the reading.
     ///
     /// # Errors
     /// [`JoinError::Unplaced`] or [`JoinError::Unusable`] if none can be used for that reason, [`JoinError::Bag`]; an error
@@ -78,7 +79,7 @@ impl Joined {
             return Err(JoinError::Unusable { topic: cloud, count: bad.sum(), why }.into());
         }
         for (why, count) in unplaced.reasons() {
-            (0..count).for_each(|_| bad.count(format!("cannot be put into the body's frame: {why}")));
+            bad.add(format!("cannot be put into the body's frame: {why}"), count);
         }
         Ok(bad)
     }
@@ -125,7 +126,18 @@ impl Joined {
         if frame == self.odom {
             return Ok(posed.pose.inverse());
         }
-        self.tree.lookup(&self.body, frame, posed.stamp_ns).map_err(|error| Unused::Frame(error.to_string()))
+        self.tree.lookup(&self.body, frame, posed.stamp_ns).map_err(|error| {
+            // Without stamps, so that equal reasons are told once.
+            Unused::Frame(match error {
+                TfError::Time { parent, child, .. } => {
+                    format!("TF {parent} → {child} moves, and no transform comes before, or none after it")
+                }
+                TfError::Gap { parent, child, .. } => {
+                    format!("TF {parent} → {child} is silent for more than {GAP_SECS_MAX} s then")
+                }
+                other => other.to_string(),
+            })
+        })
     }
 }
 

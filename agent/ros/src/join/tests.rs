@@ -1,5 +1,5 @@
-//! Drives in bags of every kind come together with their poses: what a laser saw lies on the room's walls. What does not
-//! come together is told by name.
+//! Drives in bags of every kind come together with their poses: what a laser saw lies on the room's walls. What does
+//! not come together is told by name.
 
 use super::drive::{BEGIN_NS, ROBOT, ROOM, Robot, header, stamp, transform};
 use super::{JoinError, Joined, Poses, Tally, Wanted, choose, gather, listed};
@@ -331,6 +331,25 @@ fn points_in_the_frame_of_the_odometry_are_put_into_that_of_the_body() {
             },
         )
         .unwrap();
+}
+
+/// A sensor on a joint that moves, whose transforms end before the drive does: the reason is told once.
+#[test]
+fn transforms_that_end_early_leave_clouds_out_and_are_told_once() {
+    let mut messages = ROBOT.drive(4.0);
+    messages.retain(|message| message.topic != "/tf_static");
+    for k in 0..20 {
+        let secs = f64::from(k) * 0.1;
+        let mut links = ROBOT.sensor_pose();
+        links.transforms.iter_mut().for_each(|link| link.header = header(secs, &link.header.frame_id));
+        links.transforms[1].transform.translation.x += 1e-6 * f64::from(k);
+        messages.push(ROBOT.message("tf", secs, &links));
+    }
+    messages.sort_by_key(|message| message.received_ns);
+    let (robot, bag, _folder) = one(&messages);
+    let (worst, count, tally) = off_walls(&bag, &robot);
+    assert!(worst < 1e-3 && count == 19, "{worst} {count}");
+    assert_eq!((counted(&tally, "TF mast → laser moves"), tally.reasons().count()), (21, 1), "{tally:?}");
 }
 
 #[test]

@@ -8,7 +8,8 @@ use crate::msg::{
 use hiroz_cdr::{BigEndian, CdrWriter};
 use proptest::prelude::*;
 
-/// What a message is read from to be any: fields are drawn from these bytes in turn, lengths are small, and text is text.
+/// What a message is read from to be any: fields are drawn from these bytes in turn, lengths are small, and text is
+/// text.
 struct Drawn<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -101,7 +102,8 @@ proptest! {
     }
 }
 
-/// As ROS 2 (Humble) wrote it: `std_msgs/Header` of frame "odom" at 1663967375.744427509 s, child "base_link", and so on.
+/// As ROS 2 (Humble) wrote it: `std_msgs/Header` of frame "odom" at 1663967375.744427509 s, child "base_link", and so
+/// on.
 #[test]
 fn alignment_is_counted_from_behind_the_header() {
     let mut bytes = vec![0, 1, 0, 0];
