@@ -1,7 +1,6 @@
-//! How messages are written: CDR of ROS 2 (XCDR1, either byte order, by [`hiroz_cdr`]) and the serialisation of ROS
-//! 1. A message is declared once, as a list of [`Field`]s, and is read and written in both. Lengths are checked
-//! against the bytes that are left before anything is allocated, so a message takes memory in proportion to its
-//! bytes.
+//! How messages are written: CDR of ROS 2 (XCDR1, either byte order, by [`hiroz_cdr`]) and what ROS 1 has in its place.
+//! A message is declared once, as a list of [`Field`]s, and is read and written in both. Lengths are checked against
+//! the bytes that are left before anything is allocated, so a message takes memory in proportion to its bytes.
 
 mod cdr;
 mod ros1;
