@@ -7,6 +7,8 @@ use crate::observation::COORDINATE_MAX;
 use merganser_protocol::config::ConfigError;
 use merganser_protocol::geometry::CovarianceError;
 use merganser_protocol::submap::PlaceError;
+use merganser_ros::bag::{BagError, BagProblem};
+use merganser_ros::join::JoinError;
 use std::io;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
@@ -227,6 +229,12 @@ pub enum Problem {
     /// A depth image is not as expected.
     #[error("{0}")]
     Image(String),
+    /// A bag cannot be read.
+    #[error("{0}")]
+    Bag(Box<BagProblem>),
+    /// Clouds and poses of a bag do not come together.
+    #[error("{0}")]
+    Join(Box<JoinError>),
     /// A folder holds nothing that can be fed to robots.
     #[error("{0}")]
     Data(String),
@@ -241,6 +249,15 @@ impl Problem {
     /// The problem, told of one line (from 1) of a file.
     pub fn at(self, path: impl Into<PathBuf>, line: usize) -> RecordingError {
         RecordingError { path: path.into(), line: Some(line), problem: self }
+    }
+}
+
+impl From<BagError> for RecordingError {
+    fn from(BagError { path, problem }: BagError) -> Self {
+        match problem {
+            BagProblem::Io(error) => Problem::Io(error).of(path),
+            problem => Problem::Bag(Box::new(problem)).of(path),
+        }
     }
 }
 

@@ -1,15 +1,18 @@
-//! Whatever lies in a folder becomes recordings, one per robot: a folder of recordings as it is; 7-Scenes RGB-D frames
-//! and LiDAR scans cut into robots by time; a planar laser's log cut into robots with its real odometry. A robot cut
-//! from frames or scans has a local frame of its own (its first body pose) and a seeded drift on its true motion, and
-//! its manifest says so.
+//! Whatever lies in a folder becomes recordings, one per robot: a folder of recordings as it is; 7-Scenes RGB-D
+//! frames and LiDAR scans cut into robots by time; a planar laser's log, or a ROS bag of one robot, cut into robots
+//! with its real odometry; ROS bags of several robots. A robot cut from frames or scans has a local frame of its own
+//! (its first body pose) and a seeded drift on its true motion, and its manifest says so.
 
 use super::cut::NAMES;
 use super::error::{Problem, RecordingError, on};
-use super::{KEYFRAMES, MANIFEST, Recording, import_laser, import_lidar, import_mrclam, import_rgbd};
+use super::import_bag::Single;
+use super::{KEYFRAMES, MANIFEST, Recording, import_bag, import_laser, import_lidar, import_mrclam, import_rgbd};
+use merganser_ros::bag::{bags_in, kind_of};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 pub use super::import_laser::{log_name, read_log};
+pub use merganser_ros::join::Wanted;
 
 /// Robots in one data set at most: each becomes a process of its own.
 pub const ROBOTS_MAX: usize = 16;
@@ -26,6 +29,8 @@ pub enum Kind {
     SevenScenes,
     /// `graph.txt` and `NNNNNN/points.bin`, or `NNNNNN.bin` and `poses.txt`.
     Lidar,
+    /// `*.mcap`, `*.db3`, `*.bag`, or folders of them with `metadata.yaml`: ROS bags.
+    Bags,
     /// One `*.clf` or `*.log`, perhaps packed (`.bz2`, `.xz`): a planar laser's log.
     Carmen,
     /// `RobotN_Odometry.dat`, `RobotN_Measurement.dat` (or packed, `.xz`) and `Barcodes.dat`: robots among landmarks.
@@ -37,6 +42,9 @@ pub enum Kind {
 /// # Errors
 /// [`Problem::Data`] if it is nothing known.
 pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
+    if folder.is_file() && kind_of(folder).is_some() {
+        return Ok(Kind::Bags);
+    }
     let entries = on(folder, folder.read_dir())?;
     let mut names: Vec<String> = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into()).collect();
     names.sort();
@@ -57,13 +65,16 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     if any(&|name| import_mrclam::robot(name).is_some()) {
         return Ok(Kind::Mrclam);
     }
+    if !bags_in(folder)?.is_empty() {
+        return Ok(Kind::Bags);
+    }
     if !import_laser::logs(&names.iter().map(String::as_str).collect::<Vec<_>>()).is_empty() {
         return Ok(Kind::Carmen);
     }
     let why = format!(
         "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \
          ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf or *.log, perhaps packed: \
-         .bz2, .xz), or MRCLAM logs (RobotN_Odometry.dat)",
+         .bz2, .xz), MRCLAM logs (RobotN_Odometry.dat), or ROS bags (*.mcap, *.db3, *.bag)",
         import_rgbd::DEPTH_SUFFIX,
         import_lidar::GRAPH,
         import_lidar::POSES,
@@ -86,8 +97,20 @@ pub struct Prepared {
 /// # Errors
 /// [`RecordingError`] for the first problem.
 pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Prepared, RecordingError> {
+    prepare_topics(data, out, seed, &Wanted::default())
+}
+
+/// The same; of ROS bags by these topics.
+///
+/// # Errors
+/// [`RecordingError`] for the first problem, one being that these are no bags, and topics are named.
+pub fn prepare_topics(data: &Path, out: &Path, seed: u64, wanted: &Wanted) -> Result<Prepared, RecordingError> {
     let mut remarks = Vec::new();
-    let folder = match detect(data)? {
+    let kind = detect(data)?;
+    if kind != Kind::Bags {
+        refuse_topics(data, wanted)?;
+    }
+    let folder = match kind {
         Kind::Recordings => data,
         Kind::SevenScenes => {
             import_rgbd::import(data, out, seed)?;
@@ -95,6 +118,10 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Prepared, Recording
         }
         Kind::Lidar => {
             remarks = import_lidar::import(data, out, seed)?;
+            out
+        }
+        Kind::Bags => {
+            remarks = import_bag::import(&bags_of(data)?, out, wanted, Single::Cut(import_bag::ROBOTS))?;
             out
         }
         Kind::Carmen => {
@@ -107,6 +134,37 @@ pub fn prepare(data: &Path, out: &Path, seed: u64) -> Result<Prepared, Recording
         }
     };
     Ok(Prepared { recordings: open_all(folder)?, remarks })
+}
+
+/// Refuses named topics of what has none.
+///
+/// # Errors
+/// [`Problem::Data`] if any is named.
+pub fn refuse_topics(data: &Path, wanted: &Wanted) -> Result<(), RecordingError> {
+    if *wanted == Wanted::default() {
+        return Ok(());
+    }
+    Err(Problem::Data("this is no ROS bag; --odometry and --cloud name topics of one: leave them out".into()).of(data))
+}
+
+/// Whether it is a bag, or a folder of bags.
+pub fn is_bag(path: &Path) -> bool {
+    let is_other = path.join(MANIFEST).exists();
+    !is_other && detect(path).is_ok_and(|kind| kind == Kind::Bags)
+}
+
+/// Makes a recording for each robot of a bag, or of a folder of bags, in `out` (a folder per robot). There are one to
+/// [`ROBOTS_MAX`].
+///
+/// # Errors
+/// [`RecordingError`] for the first problem.
+pub fn prepare_bag(path: &Path, out: &Path, wanted: &Wanted) -> Result<Prepared, RecordingError> {
+    let remarks = import_bag::import(&bags_of(path)?, out, wanted, Single::Whole)?;
+    Ok(Prepared { recordings: open_some(out, 1)?, remarks })
+}
+
+fn bags_of(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
+    if path.is_file() { Ok(vec![path.into()]) } else { Ok(bags_in(path)?) }
 }
 
 /// Cuts one laser log into so many robots, in `out` (a folder per robot). There are two to [`LOG_ROBOTS_MAX`].
@@ -126,6 +184,10 @@ pub fn prepare_log(log: &Path, out: &Path, robots: usize) -> Result<Prepared, Re
 /// # Errors
 /// [`RecordingError`] for the first problem: one that cannot be read, two of the same robot, fewer than two.
 pub fn open_all(folder: &Path) -> Result<Vec<Recording>, RecordingError> {
+    open_some(folder, 2)
+}
+
+fn open_some(folder: &Path, least: usize) -> Result<Vec<Recording>, RecordingError> {
     let mut folders = Vec::new();
     for entry in on(folder, folder.read_dir())? {
         let path = on(folder, entry)?.path();
@@ -135,7 +197,7 @@ pub fn open_all(folder: &Path) -> Result<Vec<Recording>, RecordingError> {
         }
     }
     folders.sort();
-    if !(2..=ROBOTS_MAX).contains(&folders.len()) {
+    if !(least..=ROBOTS_MAX).contains(&folders.len()) {
         let why = format!("holds {} recordings; a swarm of 2 to {ROBOTS_MAX} robots can be played", folders.len());
         return Err(Problem::Data(why).of(folder));
     }

@@ -7,9 +7,9 @@ use super::Writer;
 use super::bounded::read_bytes;
 use super::cut::NAMES;
 use super::error::{Problem, RecordingError, on};
-use crate::carmen::{Log, Parser, Scan, keyframes};
+use crate::carmen::{Log, Parser, keyframes};
+use crate::deal::deal;
 use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
-use core::ops::Range;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::ids::Name;
 use merganser_protocol::submap::CovarianceOf;
@@ -24,12 +24,20 @@ const LOOSE_SUFFIXES: [&str; 3] = [".log", ".log.bz2", ".log.xz"];
 const LOG_BYTES_MAX: u64 = 512_000_000;
 /// Robots made.
 const ROBOTS: usize = 3;
-/// Share of the log by which a robot's stretch reaches into each neighbour's.
-const REACH: f64 = 0.1;
-/// Every third scan is enough for a robot where they lie so far apart at most, in the mean, m.
-const APART_MAX_M: f64 = 0.5;
 /// A submap may take as long as it likes, s: wheels drift by the way, and the stamps of some logs only count scans.
 const SECS_MAX: f64 = 1e6;
+
+/// What suits a planar laser on wheels.
+pub(super) fn planar() -> Config {
+    let mut config = Config::default();
+    config.submap.sensor = Sensor::Laser2d;
+    config.submap.distance_m = 6.0;
+    // Never by rotation: a submap that shows a place from all sides is recognised better.
+    config.submap.rotation_deg = 360.0;
+    config.submap.keyframes_max = 32;
+    config.submap.secs_max = SECS_MAX;
+    config
+}
 
 /// The name of a log without its ending; `None` if it is not named as one.
 pub fn log_name(file: &str) -> Option<&str> {
@@ -70,14 +78,8 @@ pub(super) fn import_log(path: &Path, out: &Path, robots: usize) -> Result<Vec<S
         let why = format!("holds {scans} scans (FLASER or ROBOTLASER1); {robots} robots need at least one each");
         return Err(Problem::Data(why).of(path));
     }
-    let mut config = Config::default();
-    config.submap.sensor = Sensor::Laser2d;
-    config.submap.distance_m = 6.0;
-    // Never by rotation: a submap that shows a place from all sides is recognised better.
-    config.submap.rotation_deg = 360.0;
-    config.submap.keyframes_max = 32;
-    config.submap.secs_max = SECS_MAX;
-    let dealt = deal(&log.scans, robots);
+    let config = planar();
+    let dealt = deal(log.scans.iter().map(|scan| &scan.pose), robots);
     for (robot, name) in NAMES.iter().enumerate().take(robots) {
         let folder = out.join(name);
         // What an earlier run left must not pass for part of this one.
@@ -111,51 +113,6 @@ pub(super) fn import_log(path: &Path, out: &Path, robots: usize) -> Result<Vec<S
         writer.finish()?;
     }
     Ok(remarks(&log))
-}
-
-/// How the scans of a log are dealt out to the robots.
-struct Deal {
-    /// To so many.
-    robots: usize,
-    /// Of scans, in all.
-    count: usize,
-    /// Every robot has only its turn's scans of its stretch, not all that no other robot's stretch holds.
-    in_turn: bool,
-}
-
-/// As close together as the log has them: the way by odometry tells.
-fn deal(scans: &[Scan], robots: usize) -> Deal {
-    let way: f64 = scans.windows(2).map(|two| (two[1].pose.translation - two[0].pose.translation).norm()).sum();
-    let count = scans.len();
-    Deal { robots, count, in_turn: way * robots as f64 <= APART_MAX_M * count as f64 }
-}
-
-impl Deal {
-    /// The scans of a robot's stretch, with those that others are given.
-    fn stretch(&self, robot: usize) -> Range<usize> {
-        let share = |k: f64| ((k.clamp(0.0, 1.0) * self.count as f64) as usize).min(self.count);
-        let all = self.robots as f64;
-        share(robot as f64 / all - REACH)..share((robot + 1) as f64 / all + REACH)
-    }
-
-    /// The scans that a robot is given.
-    fn of(&self, robot: usize) -> impl Iterator<Item = usize> {
-        self.stretch(robot).filter(move |&k| {
-            let drive_here = |other: &usize| self.in_turn || self.stretch(*other).contains(&k);
-            let robots: Vec<usize> = (0..self.robots).filter(drive_here).collect();
-            robots[k % robots.len()] == robot
-        })
-    }
-
-    fn how(&self, robot: usize) -> String {
-        let Range { start, end } = self.stretch(robot);
-        let which = if self.in_turn {
-            format!("one of {} scans", self.robots)
-        } else {
-            "the scans, alternately where another robot drives,".into()
-        };
-        format!("{which} from {start} to {end} (counted from 0)")
-    }
 }
 
 /// What was amiss with a log, and what was done about it.

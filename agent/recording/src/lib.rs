@@ -10,10 +10,12 @@ mod bounded;
 pub mod carmen;
 pub mod cloud;
 mod cut;
+mod deal;
 pub mod depth;
 mod drift;
 mod error;
 pub mod import;
+mod import_bag;
 mod import_laser;
 mod import_lidar;
 mod import_mrclam;
@@ -274,6 +276,8 @@ fn read_truth(path: &Path, keyframes: &[KeyframeLine]) -> Result<Vec<TruthLine>,
     Ok(truth)
 }
 
+#[cfg(test)]
+mod bag_tests;
 #[cfg(test)]
 mod import_tests;
 #[cfg(test)]

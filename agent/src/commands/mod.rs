@@ -7,7 +7,9 @@ pub mod graph;
 pub mod keys;
 pub mod replay;
 pub mod run;
+mod scratch;
 pub mod store;
+pub mod topics;
 pub mod watch;
 
 use anyhow::{Context, Result};

@@ -1,19 +1,22 @@
 //! `merganser run`: one robot's agent, from its configuration to an orderly end on SIGINT or SIGTERM.
 
-use super::{runtime, say};
+use super::scratch::Scratch;
+use super::topics::Topics;
+use super::{BadInput, runtime, say};
 use crate::config::FileConfig;
 use crate::driver::Finished;
 use crate::host::{Host, Options};
 use crate::link::scouting::Scouting;
 use crate::link::session::{self, LinkError};
 use crate::queue::{Drops, Inbox};
+use crate::recording::import::{self, Prepared};
 use crate::recording::{Recording, Remarks};
 use crate::telemetry;
 use anyhow::{Context, Result};
 use merganser_protocol::agent::io::{Command, Input};
 use merganser_protocol::time::Stamp;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
@@ -31,9 +34,12 @@ pub struct RunArgs {
     /// The configuration file.
     #[arg(long, short, value_name = "FILE")]
     pub config: PathBuf,
-    /// Feed keyframes of this recording, as if the robot's SLAM sent them.
-    #[arg(long, value_name = "DIR")]
+    /// Feed keyframes of this recording or ROS bag, as if the robot's SLAM sent them.
+    #[arg(long, value_name = "PATH")]
     pub recording: Option<PathBuf>,
+    /// Which topics of a ROS bag.
+    #[command(flatten)]
+    pub topics: Topics,
     /// Feed the recording this many times faster than it was made.
     #[arg(long, value_name = "X", default_value_t = 1.0, requires = "recording", value_parser = speed)]
     pub speed: f64,
@@ -65,13 +71,43 @@ fn speed(text: &str) -> Result<f64, String> {
 pub fn run(args: &RunArgs) -> Result<bool> {
     let config = FileConfig::load(&args.config)?;
     telemetry::init(&config.log);
-    let recording = args.recording.as_ref().map(|folder| Recording::open(folder)).transpose()?;
+    // What is made of a bag lies there until the agent ends.
+    let mut scratch = None;
+    if args.recording.is_none() {
+        args.topics.refuse("--recording")?;
+    }
+    let recording = args.recording.as_ref().map(|path| open(path, args, &config, &mut scratch)).transpose()?;
     let runtime = runtime()?;
     let finished = runtime.block_on(live(args, config, recording));
     runtime.shutdown_timeout(Duration::from_millis(200)); // a job that still runs is of no use any more
     let finished = finished?;
     say(&format!("digest {}", finished.digest))?;
     Ok(true)
+}
+
+/// A recording, or what a bag holds of this robot.
+fn open(path: &Path, args: &RunArgs, config: &FileConfig, scratch: &mut Option<Scratch>) -> Result<Recording> {
+    let wanted = args.topics.wanted();
+    if !import::is_bag(path) {
+        import::refuse_topics(path, &wanted)?;
+        return Ok(Recording::open(path)?);
+    }
+    let scratch = scratch.insert(Scratch::new("run")?);
+    let Prepared { mut recordings, remarks } = import::prepare_bag(path, scratch.path(), &wanted)?;
+    remarks.iter().for_each(|remark| warn!("{remark}"));
+    if recordings.len() == 1 {
+        return Ok(recordings.remove(0));
+    }
+    let names: Vec<String> = recordings.iter().map(|recording| recording.manifest().robot.to_string()).collect();
+    let mine = recordings.into_iter().find(|recording| recording.manifest().robot == config.robot);
+    mine.ok_or_else(|| {
+        BadInput::told(format!(
+            "{}: holds the robots {}, none of which is {}: choose one by its topics, --odometry /NAME/… --cloud /NAME/…",
+            path.display(),
+            names.join(", "),
+            config.robot
+        ))
+    })
 }
 
 async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recording>) -> Result<Finished> {

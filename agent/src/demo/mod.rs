@@ -23,6 +23,7 @@ mod scale_tests;
 #[cfg(test)]
 mod tests;
 
+use crate::commands::topics::Topics;
 use crate::commands::{runtime, say};
 use crate::config::{LogConfig, LogFormat};
 use crate::recording::Recording;
@@ -52,9 +53,12 @@ const TIMEOUT_AFTER_SECS: f64 = 600.0;
 #[derive(Clone, Debug, clap::Args)]
 pub struct DemoArgs {
     /// Use this data instead of the built-in recordings: a folder of recordings (one folder per robot), of 7-Scenes
-    /// RGB-D frames, or of LiDAR scans (KITTI's, or a gtsam_points dump).
-    #[arg(long, value_name = "DIR")]
+    /// RGB-D frames, of LiDAR scans (KITTI's, or a gtsam_points dump), of logs, or of ROS bags; or one bag.
+    #[arg(long, value_name = "PATH")]
     pub data: Option<PathBuf>,
+    /// Which topics of a ROS bag.
+    #[command(flatten)]
+    pub topics: Topics,
     /// Feed the recordings this many times faster than they were made.
     #[arg(long, value_name = "X", default_value_t = 10.0, value_parser = positive)]
     pub speed: f64,
@@ -156,10 +160,11 @@ async fn play(args: &DemoArgs, recordings: &[Recording], tracks: &[Track], work:
 fn prepare(args: &DemoArgs, work: &Path) -> Result<(Vec<Recording>, Option<Bounds>)> {
     let folder = work.join(RECORDINGS);
     let Some(data) = &args.data else {
+        args.topics.refuse("--data")?;
         bundle::unpack(&folder)?;
         return Ok((import::open_all(&folder)?, Some(Bounds { translation_m: 0.15, rotation_deg: 1.5 })));
     };
-    let Prepared { recordings, remarks } = import::prepare(data, &folder, args.seed)?;
+    let Prepared { recordings, remarks } = import::prepare_topics(data, &folder, args.seed, &args.topics.wanted())?;
     let warn = |text: String| drop(console::Term::stderr().write_line(&format!("merganser: {text}")));
     remarks.into_iter().for_each(|remark| warn(format!("{}: {remark}", data.display())));
     for recording in &recordings {

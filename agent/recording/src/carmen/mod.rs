@@ -9,6 +9,7 @@ mod keyframes;
 mod message;
 
 pub use keyframes::keyframes;
+pub(crate) use keyframes::{STEP_M, STEP_RAD, driven};
 pub use message::{RANGE_M, READINGS_MAX};
 
 use crate::line_error::LineError;

@@ -4,13 +4,15 @@
 mod examine;
 mod report;
 
+use super::scratch::Scratch;
+use super::topics::Topics;
 use super::{BadInput, runtime, say};
 use crate::config::FileConfig;
 use crate::keys;
 use crate::link::overhear::overhear;
 use crate::recording::Recording;
 use crate::recording::import;
-use anyhow::{Context, Result};
+use anyhow::Result;
 pub use examine::{Examination, Examined};
 use merganser_protocol::time::Instant;
 use std::path::{Path, PathBuf};
@@ -19,7 +21,7 @@ use std::time::Duration;
 /// What `merganser doctor` can be told.
 #[derive(Clone, Debug, clap::Args)]
 #[command(
-    after_help = "PATH is a recording, a folder of recordings, a data set that `merganser demo --data` reads, or one CARMEN log. With \
+    after_help = "PATH is a recording, a folder of recordings, a data set that `merganser demo --data` reads, a ROS bag, or one CARMEN log. With \
                         --config it listens to a running SLAM instead, where this robot's agent would; the agent must \
                         not run meanwhile.\n\
                         Exit codes: 0 nothing to change, 1 something, 2 the command line or a file is wrong."
@@ -38,6 +40,8 @@ pub struct Source {
 pub struct DoctorArgs {
     #[command(flatten)]
     source: Source,
+    #[command(flatten)]
+    topics: Topics,
     /// How long to listen.
     #[arg(long, value_name = "SECS", default_value_t = 10.0, value_parser = secs)]
     pub secs: f64,
@@ -62,8 +66,11 @@ const LOG_ROBOTS: usize = 2;
 /// A file that cannot be used, or an endpoint that cannot be had.
 pub fn run(args: &DoctorArgs) -> Result<bool> {
     let examined = match &args.source {
-        Source { config: Some(config), .. } => vec![listen(&FileConfig::load(config)?, args.secs)?],
-        Source { path: Some(path), .. } => of_path(path)?,
+        Source { config: Some(config), .. } => {
+            args.topics.refuse("its path")?;
+            vec![listen(&FileConfig::load(config)?, args.secs)?]
+        }
+        Source { path: Some(path), .. } => of_path(path, &args.topics)?,
         Source { .. } => return Err(BadInput::told("name a recording, or a configuration by --config")),
     };
     let text = if args.json {
@@ -95,15 +102,21 @@ fn listen(config: &FileConfig, secs: f64) -> Result<Examined> {
     Ok(examination.finish(Some(&key)))
 }
 
-fn of_path(path: &Path) -> Result<Vec<Examined>> {
+fn of_path(path: &Path, topics: &Topics) -> Result<Vec<Examined>> {
     if path.join(crate::recording::MANIFEST).is_file() {
+        import::refuse_topics(path, &topics.wanted())?;
         return Ok(vec![of_recording(&Recording::open(path)?)?]);
     }
-    let scratch = Scratch::new()?;
-    let prepared = if path.is_file() {
-        import::prepare_log(path, &scratch.0, LOG_ROBOTS)?
+    let scratch = Scratch::new("doctor")?;
+    let prepared = if import::is_bag(path) {
+        import::prepare_bag(path, scratch.path(), &topics.wanted())?
     } else {
-        import::prepare(path, &scratch.0, 1)?
+        import::refuse_topics(path, &topics.wanted())?;
+        if path.is_file() {
+            import::prepare_log(path, scratch.path(), LOG_ROBOTS)?
+        } else {
+            import::prepare(path, scratch.path(), 1)?
+        }
     };
     for remark in prepared.remarks {
         console::Term::stderr().write_line(&format!("merganser: {}: {remark}", path.display()))?;
@@ -121,22 +134,4 @@ fn of_recording(recording: &Recording) -> Result<Examined> {
         examination.take(None, recording.keyframe(index)?);
     }
     Ok(examination.finish(None))
-}
-
-/// A folder for what is made of a data set, gone when it is no longer needed.
-struct Scratch(PathBuf);
-
-impl Scratch {
-    /// A new one: what stands there already is somebody else's, and is not removed.
-    fn new() -> Result<Self> {
-        let path = std::env::temp_dir().join(format!("merganser-doctor-{}", std::process::id()));
-        std::fs::create_dir(&path).with_context(|| format!("cannot make {}", path.display()))?;
-        Ok(Self(path))
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0); // what is left there does no harm
-    }
 }

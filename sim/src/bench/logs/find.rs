@@ -1,7 +1,7 @@
 //! What lies in a folder and can be played: laser logs with a truth beside them, and whatever else the importer knows.
 
 use merganser_protocol::config::Sensor;
-use merganser_recording::import::{Kind, Prepared, detect, log_name, prepare, prepare_log};
+use merganser_recording::import::{Kind, Prepared, detect, is_bag, log_name, prepare, prepare_log};
 use merganser_recording::{Recording, TRUTH};
 use std::path::{Path, PathBuf};
 
@@ -75,6 +75,10 @@ fn look(folder: &Path, depth: usize, sets: &mut Vec<Set>, left_out: &mut Vec<Str
         Ok(Kind::SevenScenes | Kind::Lidar) => {
             sets.push(Set { name: name(), path: folder.into(), truth: TruthFile::Recorded });
             return Ok(());
+        }
+        Ok(Kind::Bags) => {
+            let bags = entries.iter().filter(|path| path.is_file() && is_bag(path));
+            left_out.extend(bags.map(|path| format!("{}: a ROS bag, whose truth is not known", path.display())));
         }
         Ok(Kind::Carmen) | Err(_) => {}
     }
