@@ -206,7 +206,7 @@ fn fields_of_count_0_are_padding_without_bytes() {
 #[test]
 fn a_viewpoint_is_told() {
     let fields = ["x y z", "4 4 4", "F F F", "1 1 1"];
-    let cloud = pcd(fields, "10 20 3 0.7071068 0 0 0.7071068", |at| bytes(at));
+    let cloud = pcd(fields, "10 20 3 0.7071068 0 0 0.7071068", bytes);
     let (points, told) = read("pcd", &cloud);
     assert_eq!(points[0], [1.0, 2.0, 3.0]);
     assert!(
