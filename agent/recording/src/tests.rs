@@ -247,7 +247,7 @@ fn bad_tables_are_told_with_their_line() {
     let endless = refused(|d| fs::write(d.join(TRUTH), "x".repeat(1 << 20)).unwrap());
     expect(&endless, TRUTH, Some(1), "longer than 8192 bytes");
     let binary = refused(|d| fs::write(d.join(TRUTH), [0xff, 0xfe, b'\n']).unwrap());
-    expect(&binary, TRUTH, None, "UTF-8");
+    expect(&binary, TRUTH, Some(1), "UTF-8");
 }
 
 #[test]
