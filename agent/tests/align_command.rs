@@ -109,6 +109,102 @@ fn what_does_not_align_is_told_with_what_was_found_and_what_to_try() {
     assert!(told["aligned"] == false && told["refused"]["why"].as_str().is_some_and(|why| why.len() > 20), "{told}");
 }
 
+/// `t_a_b`.
+fn t_a_b(told: &Value) -> Se3 {
+    relation(told).0
+}
+
+/// Landmarks with labels as a PLY of text, seen from a body at `t_world_body`, in units of so many metres.
+fn landmarks(path: &Path, t_world_body: &Se3, unit_m: f64, labelled: bool) {
+    use std::fmt::Write as _;
+    let properties =
+        ["cxx", "cxy", "cxz", "cyy", "cyz", "czz"].map(|name| format!("property double {name}\n")).concat();
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex 24\nproperty float x\nproperty float y\nproperty float z\n{properties}\
+         property int label\nend_header\n"
+    );
+    for k in 0..24_u32 {
+        let turn = 2.399_963 * f64::from(k);
+        let at = Vector3::new(4.0 * turn.cos(), 3.0 * turn.sin(), f64::from(k % 5) * 0.5)
+            + Vector3::new(0.3, 0.0, 0.1) * f64::from(k % 7);
+        let p = (t_world_body.inverse() * at) / unit_m;
+        let variance = 4e-4 / (unit_m * unit_m);
+        let label = if labelled { i64::from(100 + k) } else { -1 };
+        let _ = writeln!(text, "{} {} {} {variance} 0 0 {variance} 0 {variance} {label}", p.x, p.y, p.z);
+    }
+    std::fs::write(path, text).unwrap();
+}
+
+#[test]
+fn landmarks_of_our_own_format_are_aligned_and_a_scale_is_found_where_it_is_not_known() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    let (a, b, halves, bare) = (file("a.ply"), file("b.ply"), file("halves.ply"), file("bare.ply"));
+    let t_world_b = Se3::new(So3::exp(&Vector3::new(0.02, -0.03, 0.8)), Vector3::new(0.7, -0.4, 0.2));
+    landmarks(a.as_ref(), &Se3::identity(), 1.0, true);
+    landmarks(b.as_ref(), &t_world_b, 1.0, true);
+    landmarks(halves.as_ref(), &t_world_b, 0.5, true);
+    landmarks(bare.as_ref(), &t_world_b, 1.0, false);
+    let aligned = |args: &[&str]| {
+        let output = align(&[args, &["--json"]].concat());
+        assert_eq!(output.status.code(), Some(0), "{output:?}");
+        json(&output)
+    };
+    let told = aligned(&[&a, &b, "--sensor", "landmarks"]);
+    assert!(t_world_b.local(&t_a_b(&told)).amax() < 0.01, "{told}");
+    // Half metres in the other.
+    let told = aligned(&[&a, &halves, "--sensor", "landmarks", "--scale", "unknown"]);
+    assert!(t_world_b.local(&t_a_b(&told)).amax() < 0.01, "{told}");
+    assert!((told["found"]["t_a_b"]["pose"]["scale"].as_f64().unwrap() - 0.5).abs() < 5e-3, "{told}");
+    let text = align(&[&a, &halves, "--sensor", "landmarks", "--scale", "unknown"]).stdout;
+    assert!(String::from_utf8(text).unwrap().contains("so much of A's unit is one of B's"));
+    let wrong = json(&align(&[&a, &halves, "--sensor", "landmarks", "--json"]));
+    assert_eq!(wrong["aligned"], false, "in metres they contradict each other: {wrong}");
+    // Nothing by which one could be known again.
+    let output = align(&[&a, &bare, "--sensor", "landmarks"]);
+    let said = String::from_utf8(output.stdout).unwrap() + &String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.code() != Some(0) && !said.contains("panicked"), "{said}");
+    // What lies in a plane tells no scale.
+    let flat = align(&[&a, &b, "--sensor", "landmarks_2d", "--scale", "unknown"]);
+    assert_eq!(flat.status.code(), Some(1), "{flat:?}");
+}
+
+/// A lump of some metres as a scanner sees it that looks along `towards`, each cloud in a frame whose origin is not where
+/// the scanner stood.
+fn lump(path: &Path, towards: Vector3<f64>, shift: f64, origin: Vector3<f64>) {
+    let radius = |n: &Vector3<f64>| {
+        1.0 + 0.20 * (3.0 * n.x + 1.0).sin() * (4.0 * n.y).cos()
+            + 0.15 * (5.0 * n.z + 2.0 * n.x).sin()
+            + 0.10 * (7.0 * n.y - 3.0 * n.z + 1.0).cos()
+            + 0.06 * (9.0 * n.x - 8.0 * n.y + 2.0).sin()
+            + 0.05 * (11.0 * n.z + 6.0 * n.y).sin()
+    };
+    let seen = (0..20_000).filter_map(|k| {
+        let (z, turn) = (1.0 - 2.0 * (f64::from(k) + shift) / 20_000.0, 2.399_963_229_728_653 * f64::from(k));
+        let flat = (1.0 - z * z).max(0.0).sqrt();
+        let n = Vector3::new(flat * turn.cos(), flat * turn.sin(), z);
+        (n.dot(&towards) > 0.1).then(|| (n * radius(&n) - origin).map(|c| c as f32).into())
+    });
+    std::fs::write(path, cloud::encode(&seen.collect::<Vec<[f32; 3]>>(), CloudFormat::Ply).unwrap()).unwrap();
+}
+
+#[test]
+fn clouds_that_were_not_seen_from_their_origin_are_refused_with_the_cure_and_aligned_by_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let [a, b] = ["a.ply", "b.ply"].map(|name| dir.path().join(name));
+    let origins = [Vector3::new(0.0, 0.0, -3.0), Vector3::new(0.0, -3.0, 0.0)];
+    lump(&a, Vector3::x(), 0.5, origins[0]);
+    lump(&b, Vector3::new(0.6_f64.cos(), 0.6_f64.sin(), 0.0), 0.13, origins[1]);
+    let args = [a.to_str().unwrap(), b.to_str().unwrap(), "--voxel", "0.03"];
+    let output = align(&args);
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("contradiction") && text.contains("try: --fused"), "{text}");
+    let told = json(&align(&[&args[..], &["--fused", "--json"]].concat()));
+    let truth = Se3::new(So3::identity(), origins[1] - origins[0]);
+    assert!(told["fused"] == true && truth.local(&t_a_b(&told)).amax() < 0.01, "{told}");
+}
+
 #[test]
 fn bad_input_is_told_with_the_file_and_the_cure() {
     let dir = tempfile::tempdir().unwrap();
@@ -121,12 +217,15 @@ fn bad_input_is_told_with_the_file_and_the_cure() {
     };
     let (las, cut) = (file("b.las", b"LASF"), file("cut.bin", &[0; 17]));
     let one = file("one.ply", &cloud::encode(&[[1.0, 2.0, 3.0]], CloudFormat::Ply).unwrap());
-    let cases: [(&[&str], &[&str]); 8] = [
+    let cases: [(&[&str], &[&str]); 11] = [
         (&[a, &las], &["b.las", "--format"]),
         (&[a, &cut], &["cut.bin"]),
         (&[a, &one], &["one.ply", "no keypoints"]),
         (&[a, "nowhere.ply"], &["nowhere.ply"]),
-        (&[a, a, "--sensor", "sonar"], &["points_3d, lidar_3d or laser_2d"]),
+        (&[a, a, "--sensor", "sonar"], &["points_3d, lidar_3d, laser_2d, landmarks or landmarks_2d"]),
+        (&[a, a, "--sensor", "landmarks"], &["a.ply", "landmarks need the property cxx"]),
+        (&[a, &cut, "--sensor", "landmarks", "--format", "xyz-bin"], &["a.ply"]),
+        (&[a, a, "--scale", "2"], &["metric or unknown"]),
         (&[a, a, "--voxel", "0"], &["0.001 to 100 m"]),
         (&[a, a, "--voxel", "0.1", "--sigma-max", "5"], &["--sigma-max", "voxels"]),
         (&[a, a, "--picture", "both.jpg"], &["both.jpg", ".png or .svg"]),

@@ -105,6 +105,42 @@ fn what_is_meant_otherwise_is_told_with_the_cure_within_twelve_submaps() {
     }
 }
 
+/// Submaps of one keyframe each, half a metre apart, of surfaces that have nothing in common.
+fn of_noise(keyframes: usize) -> Examined {
+    let recording = Recording::open(Path::new("recordings/alpha")).unwrap();
+    let mut config = recording.manifest().config.clone();
+    config.submap.keyframes_max = 1;
+    let mut examination = Examination::new("alpha".to_owned(), config);
+    let mut state = 1_u64;
+    let mut draw = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 40) as f32 / (1 << 24) as f32
+    };
+    let template = recording.keyframe(1).unwrap();
+    for k in 0..keyframes {
+        assert_eq!(examination.has_enough(), k >= 24, "{k}");
+        let mut keyframe = Keyframe { stamp: Stamp(template.stamp.0 + 1_000_000_000 * k as i64), ..template.clone() };
+        keyframe.pose.pose = Se3::new(So3::identity(), Vector3::new(0.5 * k as f64, 0.0, 0.0));
+        keyframe.points = (0..3000).map(|_| [20.0 * draw() - 10.0, 20.0 * draw() - 10.0, 4.0 * draw() - 1.0]).collect();
+        examination.take(None, keyframe);
+    }
+    examination.finish(None)
+}
+
+#[test]
+fn as_many_submaps_are_looked_at_and_aligned_as_the_limits_say() {
+    let tells = |seen: &Examined| seen.remarks.iter().any(|told| told.contains("aligns with the one after it"));
+    // Of two pairs nothing is concluded, of three it is.
+    for (submaps, told) in [(3, false), (4, true)] {
+        let seen = of_noise(submaps);
+        assert_eq!((seen.submaps, seen.aligned, tells(&seen)), (submaps, [0, submaps - 1], told), "{:?}", seen.remarks);
+    }
+    for (keyframes, submaps, pairs) in [(13, 13, 12), (26, 24, 12)] {
+        let seen = of_noise(keyframes);
+        assert_eq!((seen.submaps, seen.aligned[1]), (submaps, pairs));
+    }
+}
+
 fn doctor(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_merganser")).arg("doctor").args(args).output().unwrap()
 }

@@ -1,10 +1,10 @@
 //! Files and what they claim are looked at before memory is taken for them.
 
 use super::error::{Problem, RecordingError, on};
-use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX};
+use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX, UNPACKING_BYTES_MAX};
 use super::remark::Remark;
 use std::fs::File;
-use std::io::Read as _;
+use std::io::{ErrorKind, Read as _};
 use std::path::Path;
 
 /// What a cloud holds, as exactly as it says.
@@ -44,6 +44,17 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
 /// The whole file as text, if it is not larger than [`CLOUD_BYTES_MAX`].
 pub(super) fn read_text(path: &Path) -> Result<String, RecordingError> {
     String::from_utf8(read_bytes(path)?).map_err(|_| Problem::Data("is no text".into()).of(path))
+}
+
+/// What an `.xz` file holds, but no more than so many bytes.
+pub(super) fn unpacked_xz(path: &Path, packed: &[u8], bytes_max: u64) -> Result<Vec<u8>, RecordingError> {
+    let reader = lzma_rust2::XzReader::new_mem_limit(packed, true, (UNPACKING_BYTES_MAX >> 10) as u32);
+    let mut bytes = Vec::new();
+    match reader.take(bytes_max).read_to_end(&mut bytes) {
+        Ok(_) => Ok(bytes),
+        Err(error) if error.kind() == ErrorKind::OutOfMemory => Err(Problem::Dictionary.of(path)),
+        Err(error) => Err(Problem::Io(error).of(path)),
+    }
 }
 
 /// Refuses a claimed number of points that is too large.

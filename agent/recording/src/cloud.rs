@@ -2,7 +2,7 @@
 //! metres in the body frame; every point must be finite and within what single precision tells apart, and no claim in a
 //! header makes us allocate more than the file itself can hold.
 
-pub use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX};
+pub use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX, UNPACKING_BYTES_MAX};
 
 use super::bounded::{Fault, Read, bounded, read_bytes};
 use super::error::{Problem, RecordingError};
@@ -10,6 +10,7 @@ use super::remark::Remark;
 use super::{bin, pcd, ply};
 use crate::manifest::{CloudFormat, XYZ_I16_UNIT_M};
 use crate::observation::COORDINATE_MAX;
+use merganser_protocol::submap::Mark;
 use std::path::Path;
 
 /// How far single precision may move a point, as a share of the cloud's extent, and in units whatever the extent.
@@ -35,6 +36,15 @@ pub fn read_remarked(path: &Path, format: CloudFormat) -> Result<(Vec<[f32; 3]>,
         line: fault.line,
         problem: fault.problem,
     })
+}
+
+/// What a PLY says of each of its points besides its place, if these are landmarks: properties `cxx cxy cxz cyy cyz czz`
+/// (its covariance, body frame, m²), and perhaps `label` and `d0` to `d31`.
+///
+/// # Errors
+/// [`RecordingError`]: no PLY, no covariances, or a covariance, label or descriptor that cannot be one.
+pub fn landmarks(path: &Path, format: CloudFormat) -> Result<Vec<Mark>, RecordingError> {
+    super::landmarks::read(path, format)
 }
 
 fn parse(bytes: &[u8], format: CloudFormat) -> Result<(Vec<[f32; 3]>, Vec<Remark>), Fault> {

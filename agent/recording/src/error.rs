@@ -1,7 +1,7 @@
 //! What can be wrong with a recording: one [`Problem`] per bad case, always told with the file and, where it is text,
 //! the line.
 
-use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX};
+use super::limits::{CLOUD_BYTES_MAX, POINTS_MAX, UNPACKING_BYTES_MAX};
 use crate::manifest::{FORMAT, KEYFRAMES_MAX, VERSION};
 use crate::observation::COORDINATE_MAX;
 use merganser_protocol::config::ConfigError;
@@ -214,6 +214,12 @@ pub enum Problem {
     /// A file has too many bytes.
     #[error("the file has {0} bytes; at most {CLOUD_BYTES_MAX} (CLOUD_BYTES_MAX) are read: thin the cloud")]
     CloudBytes(u64),
+    /// An `.xz` file wants more memory than it gets.
+    #[error(
+        "wants more than {} MiB (UNPACKING_BYTES_MAX) for its dictionary; pack it by `xz -9` or less, or unpack it",
+        UNPACKING_BYTES_MAX >> 20
+    )]
+    Dictionary,
     /// A point is NaN, infinite or absurdly far.
     #[error(
         "point {0} (counted from 0) is not finite or beyond {COORDINATE_MAX:e} m; leave invalid returns \

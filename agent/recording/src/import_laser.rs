@@ -4,7 +4,7 @@
 //! another robot drives, too.
 
 use super::Writer;
-use super::bounded::read_bytes;
+use super::bounded::{read_bytes, unpacked_xz};
 use super::cut::NAMES;
 use super::error::{Problem, RecordingError, on};
 use crate::carmen::{Log, Parser, keyframes};
@@ -140,7 +140,7 @@ pub fn read_log(path: &Path) -> Result<Log, RecordingError> {
     let bytes = read_bytes(path)?;
     let bytes = match path.extension().and_then(|extension| extension.to_str()) {
         Some("bz2") => unpacked(path, bzip2::read::MultiBzDecoder::new(Cursor::new(bytes)))?,
-        Some("xz") => unpacked(path, lzma_rust2::XzReader::new(Cursor::new(bytes), true))?,
+        Some("xz") => unpacked_xz(path, &bytes, LOG_BYTES_MAX + 1)?,
         _ => bytes,
     };
     if bytes.len() as u64 > LOG_BYTES_MAX {

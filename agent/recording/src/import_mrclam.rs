@@ -3,7 +3,7 @@
 //! handed over under their bar codes, and where other robots were seen.
 
 use super::Writer;
-use super::bounded::read_bytes;
+use super::bounded::{read_bytes, unpacked_xz};
 use super::error::{Problem, RecordingError, on};
 use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
 use crate::mrclam::{MrclamError, keyframes, position, sightings, speeds, subjects};
@@ -11,7 +11,6 @@ use merganser_protocol::agent::io::PositionSighting;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::ids::Name;
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// What a robot's odometry file is called, around its number.
@@ -131,10 +130,7 @@ fn read<T>(data: &Path, name: &str, parse: impl Fn(&str) -> Result<T, MrclamErro
 }
 
 fn unpacked(path: &PathBuf) -> Result<Vec<u8>, RecordingError> {
-    let packed = read_bytes(path)?;
-    let mut bytes = Vec::new();
-    let reader = lzma_rust2::XzReader::new(packed.as_slice(), true);
-    on(path, reader.take(FILE_BYTES_MAX + 1).read_to_end(&mut bytes))?;
+    let bytes = unpacked_xz(path, &read_bytes(path)?, FILE_BYTES_MAX + 1)?;
     if bytes.len() as u64 > FILE_BYTES_MAX {
         return Err(Problem::Data(format!("unpacks to more than {FILE_BYTES_MAX} bytes; cut the log")).of(path));
     }

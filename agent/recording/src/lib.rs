@@ -228,8 +228,17 @@ impl Recording {
 /// and not by whatever else is new in it.
 fn read_manifest(path: &Path) -> Result<Manifest, RecordingError> {
     let file = on(path, std::fs::File::open(path))?;
-    let mut text = String::new();
-    on(path, file.take(MANIFEST_BYTES_MAX).read_to_string(&mut text))?;
+    let mut bytes = Vec::new();
+    on(path, file.take(MANIFEST_BYTES_MAX + 1).read_to_end(&mut bytes))?;
+    if bytes.len() as u64 > MANIFEST_BYTES_MAX {
+        let why = format!("is longer than {MANIFEST_BYTES_MAX} bytes (MANIFEST_BYTES_MAX); is this the manifest?");
+        return Err(Problem::Manifest(why).of(path));
+    }
+    let text = String::from_utf8(bytes).map_err(|error| {
+        let good = &error.as_bytes()[..error.utf8_error().valid_up_to()];
+        let line = good.iter().filter(|byte| **byte == b'\n').count() + 1;
+        Problem::Manifest("is no text; save it as UTF-8".into()).at(path, line)
+    })?;
     let refuse = |error: toml::de::Error| {
         let problem = Problem::Manifest(error.message().trim_end().to_owned());
         let line = error.span().map(|span| text.bytes().take(span.start).filter(|b| *b == b'\n').count() + 1);

@@ -314,6 +314,11 @@ fn what_a_first_user_sends_is_told_by_field_count_and_order() {
     assert!(seen.contains("covariance: 6 numbers are wanted, not 8: the upper triangle of the 3×3"), "{seen}");
     let text = good.replace("\"points\"", r#""place": {"model": "NaN \" Infinity", "metric": "x"}, "points""#);
     assert!(told(&text).contains("unknown variant `x`"), "{}", told(&text));
+    // A field's name is the sender's.
+    let long = told(&good.replacen("\"points\"", &format!("\"a\\nb{}\": NaN, \"points\"", "c".repeat(9000)), 1));
+    assert!(long.starts_with("JSON: a bccc") && long.len() < 600 && !long.contains('\n'), "{long}");
+    let unknown = told(&good.replacen("\"points\"", "\"a\\nb\": 1, \"points\"", 1));
+    assert!(unknown.contains("unknown field `a b`"), "{unknown}");
     // Sent without an encoding, which says postcard.
     for json in [good.clone(), format!(" \n{}", good.replace("[[1, 2, 3]]", "[[NaN, 2, 3]]"))] {
         for error in [

@@ -126,11 +126,11 @@ fn read(
 ) -> Result<(), RecordingError> {
     let mut reader = BufReader::new(on(path, File::open(path))?);
     let columns = header.split(',').count();
-    let mut line = String::new();
+    let mut line = Vec::new();
     for number in 1.. {
         line.clear();
         let limit = LINE_BYTES_MAX as u64 + 1;
-        if on(path, reader.by_ref().take(limit).read_line(&mut line))? == 0 {
+        if on(path, reader.by_ref().take(limit).read_until(b'\n', &mut line))? == 0 {
             if number == 1 {
                 return Err(Problem::Header(header).at(path, 1));
             }
@@ -142,7 +142,9 @@ fn read(
         if number > KEYFRAMES_MAX + 1 {
             return Err(Problem::KeyframesRange(number - 1).at(path, number));
         }
-        let text = line.trim_end_matches(['\n', '\r']);
+        let text =
+            str::from_utf8(&line).map_err(|_| Problem::Data("is no text; save it as UTF-8".into()).at(path, number))?;
+        let text = text.trim_end_matches(['\n', '\r']);
         if number == 1 {
             if text != header {
                 return Err(Problem::Header(header).at(path, 1));

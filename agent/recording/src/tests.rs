@@ -162,6 +162,23 @@ fn bad_manifests_are_told() {
     expect(&with("voxel_m = 0.1", "voxel_m = -1.0"), MANIFEST, None, "config.submap.voxel_m");
     expect(&with("voxel_m = 0.1", "voxel = 0.1"), MANIFEST, Some(13), "voxel");
     expect(&with("format = ", "format == "), MANIFEST, Some(1), "");
+    let latin = |d: &Path| {
+        let bytes = fs::read(d.join(MANIFEST)).unwrap();
+        let at = bytes.windows(6).position(|part| part == b"a test").unwrap();
+        fs::write(d.join(MANIFEST), [&bytes[..at], b"caf\xe9", &bytes[at..]].concat()).unwrap();
+    };
+    expect(&refused(latin), MANIFEST, Some(8), "is no text; save it as UTF-8");
+    let padded = |more: u64| {
+        move |d: &Path| {
+            let mut text = fs::read_to_string(d.join(MANIFEST)).unwrap();
+            text.extend(std::iter::repeat_n('\n', (MANIFEST_BYTES_MAX + more) as usize - text.len()));
+            fs::write(d.join(MANIFEST), text).unwrap();
+        }
+    };
+    expect(&refused(padded(1)), MANIFEST, None, "MANIFEST_BYTES_MAX");
+    let folder = good();
+    padded(0)(folder.path());
+    assert!(Recording::open(folder.path()).is_ok());
     expect(
         &with("origin = ", "unit_m = 0.5\norigin = "),
         MANIFEST,
@@ -230,7 +247,7 @@ fn bad_tables_are_told_with_their_line() {
     let endless = refused(|d| fs::write(d.join(TRUTH), "x".repeat(1 << 20)).unwrap());
     expect(&endless, TRUTH, Some(1), "longer than 8192 bytes");
     let binary = refused(|d| fs::write(d.join(TRUTH), [0xff, 0xfe, b'\n']).unwrap());
-    expect(&binary, TRUTH, None, "UTF-8");
+    expect(&binary, TRUTH, Some(1), "UTF-8");
 }
 
 #[test]

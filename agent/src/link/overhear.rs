@@ -35,8 +35,9 @@ impl Overheard {
     fn take(&mut self, read: Result<Input, String>) {
         match read {
             Ok(Input::Keyframe(keyframe)) => {
-                self.points += keyframe.points.len();
-                if self.keyframes.len() < KEYFRAMES_MAX && self.points < POINTS_MAX {
+                let points = self.points + keyframe.points.len();
+                if self.keyframes.len() < KEYFRAMES_MAX && points <= POINTS_MAX {
+                    self.points = points;
                     self.keyframes.push((Instant::now(), keyframe));
                 } else {
                     self.refuse(format!(
@@ -88,6 +89,7 @@ pub async fn overhear(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::observation::{self, Format};
 
     #[test]
     fn so_many_reasons_are_told_apart_and_the_rest_is_counted_together() {
@@ -96,5 +98,26 @@ mod tests {
         heard.take(Err("0".into()));
         assert_eq!(heard.refused.len(), REASONS_MAX + 1);
         assert_eq!((heard.refused["0"], heard.refused["for other reasons"]), (2, REASONS_MAX as u64));
+    }
+
+    #[test]
+    fn so_many_keyframes_and_points_are_kept_and_the_rest_is_counted() {
+        let seen = |points: usize| {
+            let keyframe = serde_json::json!({"stamp_ns": 1, "translation": [0, 0, 0], "rotation": [0, 0, 0, 1],
+                "covariance": (0..6).flat_map(|r| (r..6).map(move |c| f64::from(u8::from(r == c)))).collect::<Vec<_>>(),
+                "points": vec![[1.0, 2.0, 3.0]; points]});
+            let keyframe = observation::keyframe(Format::Json, keyframe.to_string().as_bytes());
+            keyframe.map(Input::Keyframe).map_err(|error| error.to_string())
+        };
+        let mut heard = Overheard::default();
+        (0..KEYFRAMES_MAX).for_each(|_| heard.take(seen(0)));
+        assert_eq!((heard.keyframes.len(), heard.refused.len()), (KEYFRAMES_MAX, 0));
+        heard.take(seen(0));
+        assert_eq!((heard.keyframes.len(), heard.refused.values().sum::<u64>()), (KEYFRAMES_MAX, 1));
+        let mut heard = Overheard { points: POINTS_MAX - 10, ..Overheard::default() };
+        heard.take(seen(11));
+        assert_eq!((heard.keyframes.len(), heard.refused.values().sum::<u64>()), (0, 1));
+        heard.take(seen(10));
+        assert_eq!((heard.keyframes.len(), heard.points), (1, POINTS_MAX), "one too many keeps no smaller one out");
     }
 }

@@ -11,6 +11,9 @@ struct Wanted {
     order: &'static str,
 }
 
+/// Characters that are told of a message at most.
+const TOLD_MAX: usize = 500;
+
 const TRIANGLE: &str = "the upper triangle of the 6×6 matrix row by row, translation before rotation; from ROS's 36: \
                         [c[6 * r + k] for r in range(6) for k in range(r, 6)]";
 const TRIANGLE_3: &str = "the upper triangle of the 3×3 matrix row by row: xx, xy, xz, yy, yz, zz";
@@ -24,7 +27,12 @@ const FIELDS: [Wanted; 4] = [
 /// Why JSON is no keyframe, sighting or position.
 pub(super) fn json(bytes: &[u8], error: &serde_json::Error) -> ObservationError {
     let told = told(bytes).unwrap_or_else(|| error.to_string());
-    ObservationError::Json(told)
+    ObservationError::Json(one_line(&told))
+}
+
+/// Names of fields are the sender's: what is told of them is one line, and not as long as they like.
+fn one_line(told: &str) -> String {
+    told.chars().map(|c| if c.is_control() { ' ' } else { c }).take(TOLD_MAX).collect()
 }
 
 /// Whether bytes that were sent as postcard are JSON.

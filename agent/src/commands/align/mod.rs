@@ -10,6 +10,7 @@ use anyhow::{Context, Result};
 use merganser_protocol::agent::job::{AlignJob, Measured, Refused};
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::geometry::Relative;
+use merganser_protocol::wire::fact::ScaleKind;
 use merganser_recording::manifest::CloudFormat;
 use side::Side;
 use std::path::PathBuf;
@@ -24,10 +25,18 @@ pub struct AlignArgs {
     pub a: PathBuf,
     /// The other.
     pub b: PathBuf,
-    /// What made the points: points_3d (a depth camera), lidar_3d or laser_2d. Without it, what a recording says; of
-    /// clouds, what their extent suggests.
+    /// What made the points: points_3d (a depth camera), lidar_3d, laser_2d, landmarks or landmarks_2d (a .ply with the
+    /// properties cxx to czz). Without it, what a recording says; of clouds, what their extent suggests.
     #[arg(long, value_name = "SENSOR", value_parser = sensor)]
     pub sensor: Option<Sensor>,
+    /// Whether A and B are in metres, or each in a unit of its own (of one camera): the scale is then estimated, too.
+    #[arg(long, value_name = "metric|unknown", value_parser = scale)]
+    pub scale: Option<ScaleKind>,
+    /// Clouds are made of several views, or their sensor was not at their origin: nothing is concluded from what it must
+    /// have looked through, so that places that look alike are told apart less often. Surfaces are still taken to face the
+    /// origin: it must lie on the side from which most of both were seen, or else within them.
+    #[arg(long)]
+    pub fused: bool,
     /// Thinning, m: about a hundredth of the range. Without it, what a recording says or the clouds' extent suggests.
     #[arg(long, value_name = "M", value_parser = length)]
     pub voxel: Option<f64>,
@@ -53,7 +62,17 @@ fn sensor(text: &str) -> Result<Sensor, String> {
         "points_3d" => Ok(Sensor::Points3d),
         "lidar_3d" => Ok(Sensor::Lidar3d),
         "laser_2d" => Ok(Sensor::Laser2d),
-        _ => Err("use points_3d, lidar_3d or laser_2d".into()),
+        "landmarks" => Ok(Sensor::Landmarks),
+        "landmarks_2d" => Ok(Sensor::Landmarks2d),
+        _ => Err("use points_3d, lidar_3d, laser_2d, landmarks or landmarks_2d".into()),
+    }
+}
+
+fn scale(text: &str) -> Result<ScaleKind, String> {
+    match text {
+        "metric" => Ok(ScaleKind::Metric),
+        "unknown" => Ok(ScaleKind::Unknown),
+        _ => Err("use metric or unknown".into()),
     }
 }
 
@@ -79,6 +98,7 @@ struct Outcome {
     config: Config,
     sides: [Side; 2],
     found: Result<Measured, Refused>,
+    fused: bool,
     picture: Option<PathBuf>,
 }
 
@@ -88,12 +108,12 @@ struct Outcome {
 /// A file or an argument that cannot be used, or a picture that cannot be written.
 pub fn run(args: &AlignArgs) -> Result<bool> {
     let picture = args.picture.as_ref().map(|path| ending(path).map(|png| (path, png))).transpose()?;
-    let sources = [side::read(&args.a, args.format)?, side::read(&args.b, args.format)?];
+    let sources = [side::read(&args.a, args)?, side::read(&args.b, args)?];
     let config = side::config(&sources, args)?;
     let [a, b] = sources;
-    let sides = [a.describe(&config)?, b.describe(&config)?];
+    let sides = [a.describe(&config, args.fused)?, b.describe(&config, args.fused)?];
     let found = look(&sides, &config, args.seed);
-    let mut outcome = Outcome { config, sides, found, picture: None };
+    let mut outcome = Outcome { config, sides, found, fused: args.fused, picture: None };
     if let Some((path, png)) = picture {
         let svg = picture::draw(&report::scene(&outcome));
         let bytes = if png { picture::png(&svg, 1.0)? } else { svg.into_bytes() };

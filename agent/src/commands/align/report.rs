@@ -3,9 +3,11 @@
 use super::{Outcome, t_a_b};
 use crate::picture::{Robot, Scene};
 use anyhow::Result;
+use merganser_protocol::agent::job::Refused;
 use merganser_protocol::geometry::Relative;
 use merganser_protocol::kinds::RefusalReason;
 use merganser_protocol::snapshot::RelationView;
+use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::Vector3;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -44,12 +46,15 @@ pub(super) fn text(outcome: &Outcome) -> String {
             let turn = pose.rotation.log().map(f64::to_degrees);
             let [x, y, z] = pose.translation.into();
             let s = &covariance;
+            let unit = if submap.scale == ScaleKind::Unknown { "of A's units" } else { "m" };
+            // Things on a table want more of them.
+            let d = if submap.voxel_m < 0.02 { 5 } else { 3 };
             let _ = write!(
                 text,
                 "aligned: t_a_b, which maps B into A\n\
-                 \x20   translation ({x:8.3}, {y:8.3}, {z:8.3}) m   σ ({:.3}, {:.3}, {:.3}) m\n\
+                 \x20   translation ({x:8.d$}, {y:8.d$}, {z:8.d$}) {unit}   σ ({:.d$}, {:.d$}, {:.d$})\n\
                  \x20   rotation    ({:8.2}, {:8.2}, {:8.2}) °   σ ({:.2}, {:.2}, {:.2}) °\n\
-                 \x20   {:.0} keypoints support it, at a noise of {:.3} m; as good by chance: once in 10^{:.0}",
+                 \x20   {:.0} keypoints support it, at a noise of {:.d$} {unit}; as good by chance: once in 10^{:.0}",
                 s[0],
                 s[1],
                 s[2],
@@ -63,9 +68,18 @@ pub(super) fn text(outcome: &Outcome) -> String {
                 found.sigma,
                 -found.log10_nfa
             );
+            if let Relative::Similarity(t) = &found.t_mine_theirs {
+                let sigma = t.covariance.matrix()[(6, 6)].sqrt();
+                let _ = write!(
+                    text,
+                    "\n    scale       {:8.4}   σ {:.4}: so much of A's unit is one of B's",
+                    pose.scale,
+                    pose.scale * sigma
+                );
+            }
         }
         Err(refused) => {
-            let (what, cure) = words(refused.not.reason);
+            let (what, cure) = advice(outcome, refused);
             let _ = write!(text, "not aligned: {what}\n    {}\n    {cure}", refused.why);
         }
     }
@@ -91,7 +105,7 @@ pub(super) fn json(outcome: &Outcome) -> Result<String> {
         Err(_) => Value::Null,
     };
     let refused = outcome.found.as_ref().err().map(|refused| {
-        let (what, cure) = words(refused.not.reason);
+        let (what, cure) = advice(outcome, refused);
         json!({"reason": refused.not.reason, "what": what, "why": refused.why, "cure": cure})
     });
     let all = json!({
@@ -100,6 +114,8 @@ pub(super) fn json(outcome: &Outcome) -> Result<String> {
         "a": side(&outcome.sides[0]),
         "b": side(&outcome.sides[1]),
         "sensor": submap.sensor,
+        "scale": submap.scale,
+        "fused": outcome.fused,
         "voxel_m": submap.voxel_m,
         "sigma_max_m": outcome.config.align.sigma_max_voxels * submap.voxel_m,
         "aligned": outcome.found.is_ok(),
@@ -122,7 +138,21 @@ fn sigmas(t_a_b: &Relative) -> [f64; 6] {
     core::array::from_fn(|k| matrix[(k, k)].sqrt())
 }
 
-/// What a refusal means, and what to try.
+/// What a refusal means, and what to try. That points would stand where a sensor looked through is no reason against a
+/// pose of clouds which were not seen from their origin, and nothing in a cloud tells that.
+fn advice(outcome: &Outcome, refused: &Refused) -> (&'static str, &'static str) {
+    let is_seen_through = ["contradiction", "seen to be free"].iter().any(|word| refused.why.contains(word));
+    match words(refused.not.reason) {
+        (what, _) if is_seen_through && !outcome.fused => (
+            what,
+            "try: --fused, if a cloud is made of several views or its sensor was not at its origin: points stand where, \
+             seen from the origin, the other cloud shows free space. Else: do they overlap by a third? Is --sensor \
+             right, and the unit the metre?",
+        ),
+        words => words,
+    }
+}
+
 fn words(reason: RefusalReason) -> (&'static str, &'static str) {
     match reason {
         RefusalReason::TooFew => {
@@ -173,5 +203,12 @@ pub(super) fn scene(outcome: &Outcome) -> Scene {
         }
         Err(refused) => (format!("not aligned: {}", words(refused.not.reason).0), refused.why.clone()),
     };
-    Scene { title, subtitle, up: Vector3::z(), robots: robots.collect(), alignments: Vec::new(), in_metres: true }
+    Scene {
+        title,
+        subtitle,
+        up: Vector3::z(),
+        robots: robots.collect(),
+        alignments: Vec::new(),
+        in_metres: outcome.config.submap.scale == ScaleKind::Metric,
+    }
 }

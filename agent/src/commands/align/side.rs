@@ -7,7 +7,7 @@ use anyhow::Result;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
 use merganser_protocol::submap::{
-    CovarianceOf, Described, Features, Keyframe, Keypoints, Submap, SubmapBuilder, describe,
+    CovarianceOf, Described, Features, Keyframe, Keypoints, Mark, Submap, SubmapBuilder, describe,
 };
 use merganser_protocol::time::Stamp;
 use merganser_recording::manifest::CloudFormat;
@@ -19,13 +19,13 @@ use std::sync::Arc;
 /// Voxels in the range of a cloud: between the 70 of 0.05 m for a depth camera's 3.5 m and the 110 of 0.5 m for a
 /// LiDAR's 55 m, which `agent/dist/default.toml` advises.
 const VOXELS_IN_RANGE: f64 = 100.0;
-/// Voxels that are suggested, m.
-const VOXELS_M: [f64; 2] = [0.02, 0.5];
+/// Voxels that are suggested, m: from those of a thing on a table to those of a street.
+const VOXELS_M: [f64; 2] = [0.001, 0.5];
 /// Points that a voxel holds at least, on average, of a cloud that it thins.
 const POINTS_IN_VOXEL: usize = 2;
 /// Clouds that reach farther are taken for a LiDAR's, m.
 const CAMERA_RANGE: f64 = 10.0;
-/// Side of the cubes in which a range is counted, m.
+/// Side of the cubes in which a range is counted, m; of small clouds a tenth of what their farthest point is off.
 const CELL_M: f64 = 0.25;
 /// Standard deviation of the one pose of a cloud, which is where it is by definition.
 const POSE_SIGMA: f64 = 1e-4;
@@ -37,7 +37,7 @@ pub(super) struct Source {
 }
 
 enum What {
-    Cloud(Vec<[f32; 3]>),
+    Cloud(Vec<[f32; 3]>, Vec<Mark>),
     Recording(Box<Recording>, usize),
 }
 
@@ -54,19 +54,21 @@ pub(super) struct Side {
 }
 
 /// Reads a cloud, or opens a recording.
-pub(super) fn read(path: &Path, format: Option<CloudFormat>) -> Result<Source> {
+pub(super) fn read(path: &Path, args: &AlignArgs) -> Result<Source> {
     let name = path.display().to_string();
     let (folder, number) = numbered(path);
     if folder.is_dir() {
         let recording = Recording::open(&folder)?;
         return Ok(Source { name, what: What::Recording(Box::new(recording), number) });
     }
-    let format = format.map_or_else(|| format_of(path), Ok)?;
+    let format = args.format.map_or_else(|| format_of(path), Ok)?;
     let (points, remarks) = cloud::read_remarked(path, format)?;
     for remark in remarks {
         console::Term::stderr().write_line(&format!("merganser: {name}: {remark}"))?;
     }
-    Ok(Source { name, what: What::Cloud(points) })
+    let sees_landmarks = args.sensor.is_some_and(Sensor::sees_landmarks);
+    let marks = if sees_landmarks { cloud::landmarks(path, format)? } else { Vec::new() };
+    Ok(Source { name, what: What::Cloud(points, marks) })
 }
 
 /// A folder, and which of its submaps, if it is named so.
@@ -96,7 +98,7 @@ fn format_of(path: &Path) -> Result<CloudFormat> {
 pub(super) fn config(sources: &[Source; 2], args: &AlignArgs) -> Result<Config> {
     let recorded = |source: &Source| match &source.what {
         What::Recording(recording, _) => Some(recording.manifest().config.clone()),
-        What::Cloud(_) => None,
+        What::Cloud(..) => None,
     };
     let [a, b] = [0, 1].map(|k| recorded(&sources[k]));
     if let (Some(a), Some(b), None) = (&a, &b, args.sensor)
@@ -108,12 +110,12 @@ pub(super) fn config(sources: &[Source; 2], args: &AlignArgs) -> Result<Config> 
         )));
     }
     let mut config = a.or(b).unwrap_or_else(|| suggested(sources));
-    if config.submap.sensor.sees_landmarks() {
-        return Err(BadInput::told(
-            "landmarks are not aligned by this command; run them through `merganser demo --data`",
-        ));
+    let is_cloud = |source: &Source| matches!(source.what, What::Cloud(..));
+    if config.submap.sensor.sees_landmarks() && args.sensor.is_none() && sources.iter().any(is_cloud) {
+        return Err(BadInput::told("one is of landmarks: state --sensor landmarks, so that the cloud is read so, too"));
     }
     config.submap.sensor = args.sensor.unwrap_or(config.submap.sensor);
+    config.submap.scale = args.scale.unwrap_or(config.submap.scale);
     config.submap.voxel_m = args.voxel.unwrap_or(config.submap.voxel_m);
     if let Some(sigma) = args.sigma_max {
         config.align.sigma_max_voxels = sigma / config.submap.voxel_m;
@@ -133,7 +135,7 @@ pub(super) fn config(sources: &[Source; 2], args: &AlignArgs) -> Result<Config> 
 
 fn suggested(sources: &[Source; 2]) -> Config {
     let clouds = sources.iter().filter_map(|source| match &source.what {
-        What::Cloud(points) => Some(points),
+        What::Cloud(points, _) => Some(points),
         What::Recording(..) => None,
     });
     let all: Vec<&[f32; 3]> = clouds.flatten().collect();
@@ -150,8 +152,9 @@ fn suggested(sources: &[Source; 2]) -> Config {
     while all.len() < POINTS_IN_VOXEL * cells(all.iter().copied(), voxel).len() && voxel < VOXELS_M[1] {
         voxel *= 1.2;
     }
-    // Of two decimals, which is easier to repeat.
-    config.submap.voxel_m = (100.0 * voxel.min(VOXELS_M[1])).round() / 100.0;
+    // Of few decimals, which is easier to repeat.
+    let decimals = if voxel < 0.02 { 1000.0 } else { 100.0 };
+    config.submap.voxel_m = (decimals * voxel.min(VOXELS_M[1])).round() / decimals;
     config
 }
 
@@ -161,24 +164,35 @@ fn cells<'a>(points: impl Iterator<Item = &'a [f32; 3]>, side: f64) -> BTreeSet<
 }
 
 /// 90 % of the surface is nearer: points are counted once in each cube of [`CELL_M`], since sensors see most of them near.
-fn range<'a>(points: impl Iterator<Item = &'a [f32; 3]>) -> f64 {
-    let distance = |cell: [i64; 3]| CELL_M * Vector3::from(cell.map(|steps| steps as f64)).norm();
-    let mut distances: Vec<f64> = cells(points, CELL_M).into_iter().map(distance).collect();
+fn range<'a>(points: impl Iterator<Item = &'a [f32; 3]> + Clone) -> f64 {
+    let far = points.clone().flatten().fold(0.0_f64, |most, c| most.max(f64::from(c.abs())));
+    let side = CELL_M.min(far / 10.0).max(1e-6);
+    let distance = |cell: [i64; 3]| side * Vector3::from(cell.map(|steps| steps as f64)).norm();
+    let mut distances: Vec<f64> = cells(points, side).into_iter().map(distance).collect();
     distances.sort_by(f64::total_cmp);
     distances.get(distances.len() * 9 / 10).copied().unwrap_or(0.0)
 }
 
 impl Source {
     /// Cuts and describes it.
-    pub(super) fn describe(self, config: &Config) -> Result<Side> {
-        let (submap, read) = match self.what {
-            What::Cloud(points) => of_cloud(&self.name, points, config)?,
+    pub(super) fn describe(self, config: &Config, fused: bool) -> Result<Side> {
+        let (mut submap, read) = match self.what {
+            What::Cloud(points, marks) => of_cloud(&self.name, points, marks, config)?,
             What::Recording(recording, number) => of_recording(&self.name, &recording, number, config)?,
         };
+        if fused {
+            // Of no point is known who saw it: nobody looked through anything, and surfaces face the origin.
+            submap.seen_from.fill(u16::MAX);
+        }
         let Described { features, keypoints, further, .. } = describe(&submap, &config.submap);
         // All that two robots would fetch for a pair that is worth a second look.
         let keypoints = further.and_then(|further| keypoints.with_further(&further)).unwrap_or(keypoints);
         if keypoints.is_empty() && config.submap.sensor != Sensor::Laser2d {
+            if config.submap.sensor.sees_landmarks() {
+                let why =
+                    "no landmarks that could be recognised: state a label or a descriptor of them (label, d0 to d31)";
+                return Err(BadInput::told(format!("{}: {why}", self.name)));
+            }
             return Err(BadInput::told(format!(
                 "{}: no keypoints: {} points are left at {} m, too few that have neighbours; use a smaller --voxel, or \
                  check the unit",
@@ -199,7 +213,7 @@ impl Source {
     }
 }
 
-fn of_cloud(name: &str, points: Vec<[f32; 3]>, config: &Config) -> Result<(Submap, usize)> {
+fn of_cloud(name: &str, points: Vec<[f32; 3]>, marks: Vec<Mark>, config: &Config) -> Result<(Submap, usize)> {
     let read = points.len();
     let covariance = Covariance::from_sigmas([POSE_SIGMA; 6]).map_err(|error| BadInput::told(error.to_string()))?;
     let keyframe = Keyframe {
@@ -208,7 +222,7 @@ fn of_cloud(name: &str, points: Vec<[f32; 3]>, config: &Config) -> Result<(Subma
         pose: PoseWithCovariance { pose: Se3::identity(), covariance },
         covariance_of: CovarianceOf::Motion,
         points,
-        marks: Vec::new(),
+        marks,
         place: None,
         up: None,
     };

@@ -40,7 +40,7 @@ pub fn solve(args: &SolveArgs) -> Result<bool> {
         count(|v| matches!(v, Verdict::Used(_))),
         counted(count(|v| *v != Verdict::Odometry), "other measurement"),
         unsigned(solved.map.chi2),
-        solved.map.dof,
+        super::solve::dof(graph, solved.map.dof),
         if solved.map.converged { "converged" } else { "NOT CONVERGED" },
     ))?;
     if !solved.map.converged {

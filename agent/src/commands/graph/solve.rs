@@ -31,7 +31,7 @@ pub fn solve(args: &SolveArgs) -> Result<bool> {
             if out.solution.converged { "converged" } else { "NOT CONVERGED" },
             counted(out.solution.iterations, "iteration"),
             unsigned(out.solution.chi2),
-            out.solution.dof,
+            dof(part, out.solution.dof),
         ))?;
         if !out.solution.converged {
             warn(&not_converged(args, k + 1));
@@ -110,6 +110,11 @@ fn certificate_line(part: &PoseGraph, outcome: &ChordalOutcome) -> String {
         unsigned(outcome.cost),
         outcome.iterations
     )
+}
+
+/// Degrees of freedom: planar measurements are kept as spatial ones, which hold the plane without saying anything of it.
+pub fn dof(graph: &PoseGraph, spatial: usize) -> usize {
+    if graph.planar { spatial / 2 } else { spatial }
 }
 
 /// A sum of squares; that of none is −0.

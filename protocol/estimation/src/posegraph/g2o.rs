@@ -365,7 +365,9 @@ fn from_plane(planar: &Matrix3<f64>) -> Option<(Matrix6<f64>, (f64, f64))> {
             out[(row, column)] = planar[(r, c)];
         }
     }
-    Some((out, (planar[(2, 2)], 2.0 / trace)))
+    let (kappa, tau) = (planar[(2, 2)], 2.0 / trace);
+    // As of spatial ones: a variance that overflows leaves no weight.
+    (kappa.is_finite() && tau.is_finite() && kappa > 0.0 && tau > 0.0).then_some((out, (kappa, tau)))
 }
 
 /// A graph as a g2o file: poses with a value, those that are fixed, then measurements. Planar graphs are written as

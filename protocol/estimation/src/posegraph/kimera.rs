@@ -4,6 +4,7 @@
 //! `is_known_inlier, weight`. A pose becomes the g2o id with the robot's letter in the top byte, as GTSAM's symbols
 //! are.
 
+use super::g2o::LENGTH_MAX;
 use super::lines::{Files, without_mark};
 use super::{MEASUREMENTS_MAX, Measurement, POSES_MAX, PoseGraph, isotropic_information, printed_matrix};
 use crate::geometry::Se3;
@@ -136,8 +137,9 @@ impl Importer {
         let number = |column| number(&row, column);
         let xyzw = [number("qx")?, number("qy")?, number("qz")?, number("qw")?];
         let norm = xyzw.iter().map(|x| x * x).sum::<f64>().sqrt();
-        let unit = Se3::from_xyzw(xyzw.map(|x| x / norm), [number("tx")?, number("ty")?, number("tz")?]);
-        let fault = |want| KimeraFault::Number { column: "qw", text: row["qw"].to_owned(), want };
+        let length = |column| length(&row, column);
+        let unit = Se3::from_xyzw(xyzw.map(|x| x / norm), [length("tx")?, length("ty")?, length("tz")?]);
+        let fault = |want| wrong(&row, "qw", want);
         let t_i_j = unit.filter(|_| (norm - 1.0).abs() < 1e-2).ok_or_else(|| fault("part of a unit quaternion"))?;
         let (kappa, tau) = (positive(&row, "kappa")?, positive(&row, "tau")?);
         let recorded = Recorded {
@@ -180,14 +182,22 @@ fn pose_id(row: &BTreeMap<&str, &str>, robot: &'static str, pose: &'static str) 
     Ok(letter << 56 | whole(pose, INDEX_MAX, "a pose's number")?)
 }
 
+fn wrong(row: &BTreeMap<&str, &str>, column: &'static str, want: &'static str) -> KimeraFault {
+    KimeraFault::Number { column, text: row[column].chars().take(40).collect(), want }
+}
+
 fn number(row: &BTreeMap<&str, &str>, column: &'static str) -> Result<f64, KimeraFault> {
-    let text = row[column];
-    let fault = || KimeraFault::Number { column, text: text.chars().take(40).collect(), want: "a finite number" };
-    text.parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(fault)
+    row[column].parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| wrong(row, column, "a finite number"))
+}
+
+fn length(row: &BTreeMap<&str, &str>, column: &'static str) -> Result<f64, KimeraFault> {
+    let value = number(row, column)?;
+    if value.abs() <= LENGTH_MAX { Ok(value) } else { Err(wrong(row, column, "a length of up to 1e12 m")) }
 }
 
 fn positive(row: &BTreeMap<&str, &str>, column: &'static str) -> Result<f64, KimeraFault> {
     let value = number(row, column)?;
-    let fault = || KimeraFault::Number { column, text: row[column].to_owned(), want: "a positive number" };
-    if value > 0.0 { Ok(value) } else { Err(fault()) }
+    // Twice a weight is an information.
+    let is_weight = value > 0.0 && (2.0 * value).is_finite();
+    if is_weight { Ok(value) } else { Err(wrong(row, column, "a positive number")) }
 }

@@ -231,6 +231,7 @@ fn faults_name_their_line_and_what_to_do() {
     assert_eq!(fault("VERTEX_SE2 0 1 1e999 3"), Fault::Number("1e999".into()));
     assert_eq!(fault("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 2"), Fault::Quaternion(2.0));
     assert_eq!(fault(&good.replacen("0 1 1", "1 1 1", 1)), Fault::SelfLoop(1));
+    assert_eq!(fault("EDGE_SE2 0 1 1 0 0 1e-320 0 0 1 0 1"), Fault::Information, "its variance overflows");
     assert_eq!(fault(&good.replace("0 1 0 1", "0 0 0 1")), Fault::Information);
     let indefinite = parsed(&good.replace("0 0 0 0 0 1 0 0 0 0", "0 0 0 0 9 1 0 0 0 0")).unwrap();
     let start = indefinite.start(Start::Relaxed, 10).unwrap();
@@ -378,6 +379,9 @@ fn kimera_tables_are_read_by_their_columns() {
     assert!(matches!(fault(&row.replace("0,0,1,7", "0,0,26,7")).what, KimeraFault::Number { column: "robot_dst", .. }));
     assert!(matches!(fault(&row.replace("0,0,0,1", "0,0,0,0")).what, KimeraFault::Number { column: "qw", .. }));
     assert_eq!(fault(&row.replace("0,0,1,7", "0,0,0,0")).what, KimeraFault::SelfLoop);
+    assert!(read(&[&row.replace(",1,2,3,", ",1e12,2,3,")]).is_ok());
+    let far = fault(&row.replace(",1,2,3,", ",1.1e12,2,3,")).to_string();
+    assert_eq!(far, "line 2: column tx: \"1.1e12\" is not a length of up to 1e12 m");
     assert_eq!(Importer::default().line("a,b").unwrap_err().what, KimeraFault::Column("robot_src"));
 }
 

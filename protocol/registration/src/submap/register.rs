@@ -147,7 +147,10 @@ pub enum RegisterError {
         ratio: f64,
     },
     /// Keypoints of a thinned cloud lie apart.
-    #[error("{share:.2} of their keypoints lie where another one does; their describer is faulty")]
+    #[error(
+        "{share:.2} of their keypoints lie where another one does: are their points in millimetres where metres are \
+         wanted? So far off they are told apart too coarsely. If not, their describer is faulty"
+    )]
     Crowded {
         /// Share of those that share a place.
         share: f64,
