@@ -81,25 +81,29 @@ fn solve(text: &str, arguments: &[&str]) -> (i32, String) {
 }
 
 #[test]
-fn a_drive_that_drifts_by_a_radian_before_it_closes_converges() {
-    let (code, said) = solve(&graph(1, 0.008), &[]); // times the root of fifteen thousand
-    assert_eq!(code, 0, "{said}");
-    assert!(said.contains("15115 poses, 16727 measurements, converged"), "{said}");
-    // Three of each measurement beyond the tree's; what errs as stated has a χ² of as many, within four σ.
-    let dof = 3.0 * LOOPS as f64;
-    let chi2 =
-        said.split("χ² ").nth(1).and_then(|rest| rest.split(' ').next()).map(|text| text.parse::<f64>().unwrap());
-    assert!(said.contains(&format!("of {dof} dof")), "{said}");
-    assert!(chi2.is_some_and(|chi2| (chi2 - dof).abs() < 4.0 * (2.0 * dof).sqrt()), "{said}");
+fn a_drive_that_drifts_by_a_radian_before_it_closes_converges_and_is_certified() {
+    let text = graph(1, 0.008); // times the root of fifteen thousand
+    for arguments in [[].as_slice(), &["--certify"]] {
+        let (code, said) = solve(&text, arguments);
+        assert_eq!(code, 0, "{said}");
+        assert!(said.contains("15115 poses, 16727 measurements, converged"), "{said}");
+        assert_eq!(said.contains("certified for the isotropic weights"), !arguments.is_empty(), "{said}");
+        // Three of each measurement beyond the tree's; what errs as stated has a χ² of as many, within four σ.
+        let dof = 3.0 * LOOPS as f64;
+        let chi2 = said.split("χ² ").nth(1).and_then(|rest| rest.split(' ').next());
+        let chi2 = chi2.map(|text| text.parse::<f64>().unwrap());
+        assert!(said.contains(&format!("of {dof} dof")), "{said}");
+        assert!(chi2.is_some_and(|chi2| (chi2 - dof).abs() < 4.0 * (2.0 * dof).sqrt()), "{said}");
+    }
 }
 
-/// Today SE-Sync's minimum is not reached on such graphs, and nothing is certified (benchmarks, section 15).
+/// With almost four radians of drift some are not solved (benchmarks, section 15).
 #[test]
-#[ignore = "night: twice ten seconds"]
+#[ignore = "night: thrice ten seconds"]
 fn what_is_not_at_a_minimum_or_not_certified_is_never_said_to_be() {
-    for (seed, sigma) in [(1, 0.008), (2, 0.03)] {
-        let (code, said) = solve(&graph(seed, sigma), &["--certify"]);
-        let is_solved = said.contains(", converged") && said.contains("certified for");
+    for seed in 1..4 {
+        let (code, said) = solve(&graph(seed, 0.03), &["--certify"]);
+        let is_solved = said.contains(", converged") && said.contains("; certified for");
         let is_told = said.contains("NOT CONVERGED") && said.contains("give it more (--iterations)");
         assert!(if code == 0 { is_solved } else { code == 1 && (is_told || said.contains("NOT CERTIFIED")) }, "{said}");
     }

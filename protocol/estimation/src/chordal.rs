@@ -5,11 +5,13 @@
 //!
 //! Start: without the constraint that rotations be rotations, two linear least-squares problems (Carlone et al. 2015,
 //! "Initialization techniques for 3D SLAM", §III.B). Then Gauss–Newton, then Newton with the exact Hessian, which is
-//! what converges quadratically where residuals are large. Perturbations are `R exp(φ^)`, `t + R ρ`.
+//! what converges quadratically where residuals are large. Perturbations are `R exp(φ^)`, `t + R ρ`; after each step
+//! the translations become those that suit the rotations best (variable projection, Golub and Pereyra 1973): a long
+//! chain that turns a little sweeps its far end along an arc, of which `ρ` is only the tangent.
 
 use super::minimise::{Normal, Objective, minimise};
 use super::solve::SolveError;
-use super::sparse::{BlockPattern, Slot, Workspace};
+use super::sparse::{BlockPattern, Factor, Slot, Workspace};
 use crate::geometry::so3::{So3, hat};
 use crate::geometry::{Se3, se3};
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
@@ -67,9 +69,9 @@ impl ChordalGraph {
     /// # Errors
     /// [`SolveError::Underconstrained`] if the graph is not connected.
     pub fn relaxed(&self) -> Result<Vec<Se3>, SolveError> {
-        let [of_rotations, of_translations] = self.patterns([3, 1])?;
+        let [of_rotations] = self.patterns([3])?;
         let rotations = self.relaxed_rotations(&of_rotations)?;
-        let translations = self.translations(&of_translations, &rotations)?;
+        let translations = Translations::new(self)?.of(self, |node| &rotations[node]);
         Ok(rotations.into_iter().zip(translations).map(|(r, t)| Se3::new(So3::from_matrix(&r), t)).collect())
     }
 
@@ -127,41 +129,59 @@ impl ChordalGraph {
         (0..self.nodes).map(|node| rotation(node).ok_or(SolveError::NotFinite)).collect()
     }
 
-    /// Minimises `Σ τ‖t_j − t_i − R_i t_ij‖²`.
-    fn translations(
-        &self,
-        pattern: &BlockPattern,
-        rotations: &[Matrix3<f64>],
-    ) -> Result<Vec<Vector3<f64>>, SolveError> {
+    /// The patterns of so many scalars a node without the first.
+    fn patterns<const N: usize>(&self, scalars: [usize; N]) -> Result<[BlockPattern; N], SolveError> {
+        let free = self.edges.iter().filter(|e| e.i > 0 && e.j > 0);
+        let sizes = scalars.map(|size| vec![size; self.nodes.saturating_sub(1)]);
+        BlockPattern::of_sizes(sizes.each_ref().map(Vec::as_slice), free.map(|e| (e.i - 1, e.j - 1)))
+    }
+}
+
+/// Which translations suit given rotations best, node 0 at the origin: the minimum of `Σ τ‖t_j − t_i − R_i t_ij‖²`, whose
+/// normal matrix is the same for any rotations.
+struct Translations {
+    pattern: BlockPattern,
+    factor: Factor,
+}
+
+impl Translations {
+    /// Factorises the normal matrix.
+    ///
+    /// # Errors
+    /// [`SolveError::Underconstrained`] if the graph is not connected.
+    fn new(graph: &ChordalGraph) -> Result<Self, SolveError> {
+        let [pattern] = graph.patterns([1])?;
         let mut h = vec![0.0; pattern.value_count()];
-        let mut b = vec![0.0; 3 * pattern.scalars()];
-        for edge in &self.edges {
-            let step = rotations[edge.i] * edge.p_i_j * edge.tau;
+        for edge in &graph.edges {
             let weight = nalgebra::Matrix1::new(edge.tau);
-            for (node, sign) in [(edge.i, -1.0), (edge.j, 1.0)].into_iter().filter(|(node, _)| *node > 0) {
+            for node in [edge.i, edge.j].into_iter().filter(|node| *node > 0) {
                 BlockPattern::add(&mut h, pattern.slot(node - 1, node - 1), &weight);
-                let start = pattern.start(node - 1);
-                for (k, x) in b.chunks_exact_mut(pattern.scalars()).enumerate() {
-                    x[start] += sign * step[k];
-                }
             }
             if edge.i > 0 && edge.j > 0 {
                 BlockPattern::add(&mut h, pattern.slot(edge.i - 1, edge.j - 1), &-weight);
             }
         }
         let factor = pattern.factorise(h, &mut Workspace::default())?;
-        pattern.solve(&factor, &mut b);
+        Ok(Self { pattern, factor })
+    }
+
+    fn of<'a>(&self, graph: &ChordalGraph, rotation: impl Fn(usize) -> &'a Matrix3<f64>) -> Vec<Vector3<f64>> {
+        let pattern = &self.pattern;
+        let mut b = vec![0.0; 3 * pattern.scalars()];
+        for edge in &graph.edges {
+            let step = rotation(edge.i) * edge.p_i_j * edge.tau;
+            for (node, sign) in [(edge.i, -1.0), (edge.j, 1.0)].into_iter().filter(|(node, _)| *node > 0) {
+                let start = pattern.start(node - 1);
+                for (k, x) in b.chunks_exact_mut(pattern.scalars()).enumerate() {
+                    x[start] += sign * step[k];
+                }
+            }
+        }
+        pattern.solve(&self.factor, &mut b);
         let n = pattern.scalars();
         let place = |node: usize| pattern.start(node - 1);
         let of = |node: usize| Vector3::new(b[place(node)], b[n + place(node)], b[2 * n + place(node)]);
-        Ok((0..self.nodes).map(|node| if node == 0 { Vector3::zeros() } else { of(node) }).collect())
-    }
-
-    /// The patterns of so many scalars a node without the first.
-    fn patterns<const N: usize>(&self, scalars: [usize; N]) -> Result<[BlockPattern; N], SolveError> {
-        let free = self.edges.iter().filter(|e| e.i > 0 && e.j > 0);
-        let sizes = scalars.map(|size| vec![size; self.nodes.saturating_sub(1)]);
-        BlockPattern::of_sizes(sizes.each_ref().map(Vec::as_slice), free.map(|e| (e.i - 1, e.j - 1)))
+        (0..graph.nodes).map(|node| if node == 0 { Vector3::zeros() } else { of(node) }).collect()
     }
 }
 
@@ -195,6 +215,7 @@ impl From<&Se3> for Pose {
 struct Chordal<'a> {
     graph: &'a ChordalGraph,
     pattern: BlockPattern,
+    translations: Translations,
     /// Per edge, its slots (i, i), (i, j), (j, j).
     slots: Vec<[Option<Slot>; 3]>,
     /// Whether `H` is the exact Hessian.
@@ -206,7 +227,7 @@ impl<'a> Chordal<'a> {
         let [pattern] = graph.patterns([6])?;
         let slot = |a: usize, b: usize| (a > 0 && b > 0).then(|| pattern.slot(a - 1, b - 1));
         let slots = graph.edges.iter().map(|e| [slot(e.i, e.i), slot(e.i, e.j), slot(e.j, e.j)]).collect();
-        Ok(Self { graph, slots, pattern, exact: false })
+        Ok(Self { graph, slots, pattern, translations: Translations::new(graph)?, exact: false })
     }
 
     fn cost_of(graph: &ChordalGraph, values: &[Pose]) -> f64 {
@@ -248,15 +269,17 @@ impl Objective for Chordal<'_> {
     }
 
     fn retract(&self, values: &Vec<Pose>, delta: &[f64]) -> Vec<Pose> {
-        let moved = |(node, pose): (usize, &Pose)| {
+        let turned = |(node, pose): (usize, &Pose)| {
             if node == 0 {
-                return *pose;
+                return pose.r;
             }
-            let xi = &delta[self.pattern.start(node - 1)..][..6];
-            let (rho, phi) = (Vector3::from_column_slice(&xi[..3]), Vector3::from_column_slice(&xi[3..]));
-            Pose { r: pose.r * So3::exp(&phi).matrix(), t: pose.t + pose.r * rho }
+            let phi = Vector3::from_column_slice(&delta[self.pattern.start(node - 1) + 3..][..3]);
+            pose.r * So3::exp(&phi).matrix()
         };
-        values.iter().enumerate().map(moved).collect()
+        let rotations: Vec<Matrix3<f64>> = values.iter().enumerate().map(turned).collect();
+        let origin = values.first().map_or_else(Vector3::zeros, |first| first.t);
+        let translations = self.translations.of(self.graph, |node| &rotations[node]);
+        rotations.into_iter().zip(translations).map(|(r, t)| Pose { r, t: origin + t }).collect()
     }
 }
 
