@@ -110,7 +110,7 @@ pub fn run(args: &AlignArgs) -> Result<bool> {
     let picture = args.picture.as_ref().map(|path| ending(path).map(|png| (path, png))).transpose()?;
     let sources = [side::read(&args.a, args)?, side::read(&args.b, args)?];
     if args.fused && !sources.iter().any(side::Source::is_cloud) {
-        return Err(BadInput::told("--fused: is for clouds; a recording knows what its sensor saw from where".into()));
+        return Err(BadInput::told("--fused is for clouds; a recording knows what its sensor saw from where"));
     }
     let config = side::config(&sources, args)?;
     let [a, b] = sources;
