@@ -1,6 +1,6 @@
 //! What the fuzz target `bags` of `agent/recording/fuzz` does with bytes, shared with the test `memory`, which measures
 //! what it takes.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a failed unwrap in a test is its report")]
+#![allow(dead_code, missing_docs, clippy::unwrap_used, reason = "a failed unwrap in a test is its report")]
 
 use merganser_ros::bag::{Bag, Flow};
 use merganser_ros::join::{Wanted, choose, gather};
