@@ -175,7 +175,8 @@ impl Bag {
         &self.damage
     }
 
-    /// Gives each message of the topics for which `wanted` says so (by their index) to `each`, file by file.
+    /// Gives each message of the topics for which `wanted` says so (by their index) to `each`, file by file, and
+    /// returns what could not be read on the way; [`Damage::beyond`] tells what of it [`Bag::damage`] did not say.
     ///
     /// # Errors
     /// [`BagError`].
@@ -183,10 +184,10 @@ impl Bag {
         &self,
         wanted: impl Fn(usize) -> bool,
         mut each: impl FnMut(Record<'_>) -> Flow,
-    ) -> Result<(), BagError> {
+    ) -> Result<Damage, BagError> {
         let mut topics = Topics { list: self.topics.clone() };
         let passed = |record: Record<'_>| if wanted(record.topic) { each(record) } else { Flow::On };
-        self.scan(&mut topics, false, &mut { passed }).map(drop)
+        self.scan(&mut topics, false, &mut { passed })
     }
 
     fn scan(
@@ -241,6 +242,16 @@ impl Damage {
         }
         let name = file.file_name().unwrap_or_default().to_string_lossy();
         self.stopped.push(format!("{name}: {why}"));
+    }
+
+    /// What of this an earlier reading of the same bag did not find.
+    pub fn beyond(&self, earlier: &Self) -> Self {
+        Self {
+            stopped: self.stopped.iter().filter(|why| !earlier.stopped.contains(why)).cloned().collect(),
+            untold: self.untold.saturating_sub(earlier.untold),
+            long: self.long.saturating_sub(earlier.long),
+            lost: self.lost.saturating_sub(earlier.lost),
+        }
     }
 
     /// A sentence for each.
