@@ -10,13 +10,15 @@ use std::path::Path;
 
 proptest! {
     #[test]
-    fn a_number_is_given_once(numbers in prop::collection::vec(prop_oneof![-8..8_i64, Just(i64::MIN), Just(i64::MAX)], 0..40)) {
+    fn a_number_is_given_once(
+        numbers in prop::collection::vec(prop_oneof![-8..8_i64, Just(i64::MIN), Just(i64::MAX)], 0..40),
+    ) {
         let (mut given, mut all) = (Given::default(), BTreeSet::new());
         for number in numbers {
             prop_assert_eq!(given.insert(number), all.insert(number));
         }
-        let runs = all.iter().filter(|number| number.checked_sub(1).is_none_or(|before| !all.contains(&before))).count();
-        prop_assert_eq!(given.ranges.len(), runs);
+        let begins = |number: &&i64| number.checked_sub(1).is_none_or(|before| !all.contains(&before));
+        prop_assert_eq!(given.ranges.len(), all.iter().filter(begins).count());
     }
 }
 
