@@ -124,6 +124,8 @@ pub struct Damage {
     pub long: u64,
     /// Messages of no topic, or that could not be unpacked.
     pub lost: u64,
+    /// What there is to tell of its files beside.
+    pub noted: Vec<String>,
 }
 
 /// A bag, whose topics are known.
@@ -137,13 +139,13 @@ pub struct Bag {
 }
 
 impl Bag {
-    /// Opens the bag at `path`, a file or a folder with `metadata.yaml`, and counts its messages, for which it is
+    /// Opens the bag at `path`, a file, a folder, or the name of one that was split ([`bags_in`]), and counts its messages, for which it is
     /// read once.
     ///
     /// # Errors
     /// [`BagError`].
     pub fn open(path: &Path) -> Result<Self, BagError> {
-        let (kind, files) = files::of_bag(path)?;
+        let files::Files { kind, files, noted } = files::of_bag(path)?;
         let mut bag = Self { path: path.into(), kind, files, topics: Vec::new(), damage: Damage::default() };
         let mut topics = Topics::default();
         let mut counts: BTreeMap<usize, u64> = BTreeMap::new();
@@ -151,6 +153,7 @@ impl Bag {
             *counts.entry(record.topic).or_default() += 1;
             Flow::On
         })?;
+        bag.damage.noted = noted;
         bag.topics = topics.list;
         for (topic, count) in counts {
             if let Some(topic) = bag.topics.get_mut(topic) {
@@ -251,6 +254,7 @@ impl Damage {
             untold: self.untold.saturating_sub(earlier.untold),
             long: self.long.saturating_sub(earlier.long),
             lost: self.lost.saturating_sub(earlier.lost),
+            noted: self.noted.iter().filter(|note| !earlier.noted.contains(note)).cloned().collect(),
         }
     }
 
@@ -267,6 +271,7 @@ impl Damage {
         if self.lost > 0 {
             told.push(format!("{} messages of no known topic, or that cannot be unpacked, are left out", self.lost));
         }
+        told.extend(self.noted.iter().cloned());
         told
     }
 }
