@@ -138,9 +138,10 @@ fn robots_are_told_apart_by_their_namespaces() {
     }
     let why = told(&messages, &Wanted::default());
     assert!(why.contains("4 topics are sensor_msgs/PointCloud2 or LaserScan"), "{why}");
+    assert!(why.ends_with("or that of each robot without its namespace: --cloud rear/scan"), "{why}");
     let (four, _folder) = bag(&messages);
     let ambiguous = joined(&four, &named("odom", "scan")).unwrap_err().to_string();
-    assert!(ambiguous.contains("name one by --cloud"), "{ambiguous}");
+    assert!(ambiguous.ends_with("name one by --cloud"), "no hint that was followed already: {ambiguous}");
     assert_eq!(joined(&four, &named("odom", "rear/scan")).unwrap().len(), 2, "relative names are those of each robot");
 }
 
@@ -461,4 +462,19 @@ fn real_bags_are_read() {
         let tally = robots[0].read(&bag, |_| true, |_, _, _| -> Result<Flow, JoinError> { Ok(Flow::On) }).unwrap();
         assert_eq!(tally.sum(), 0, "{tally:?}");
     }
+}
+
+/// What is lost after the opening, which looks at no message's bytes, is told once.
+#[test]
+fn what_the_second_reading_of_a_bag_loses_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.db3");
+    write::db3(&path, &ROBOT.drive(4.0), false, false);
+    let long = crate::limits::MESSAGE_BYTES_MAX + (2 << 20);
+    let change = format!("UPDATE messages SET data = zeroblob({long}) WHERE id = 5");
+    rusqlite::Connection::open(&path).unwrap().execute_batch(&change).unwrap();
+    let bag = Bag::open(&path).unwrap();
+    let robots = joined(&bag, &Wanted::default()).unwrap();
+    assert_eq!(counted(&robots[0].tally, "1 messages of more than"), 1, "{:?}", robots[0].tally);
+    assert_eq!(off_walls(&bag, &robots[0]).2.sum(), 0);
 }
