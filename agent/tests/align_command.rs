@@ -202,6 +202,8 @@ fn clouds_that_were_not_seen_from_their_origin_are_refused_with_the_cure_and_ali
     assert!(text.contains("contradiction") && text.contains("try: --fused"), "{text}");
     let told = json(&align(&[&args[..], &["--fused", "--json"]].concat()));
     let truth = Se3::new(So3::identity(), origins[1] - origins[0]);
+    let text = String::from_utf8(align(&[&args[..], &["--fused"]].concat()).stdout).unwrap();
+    assert!(text.contains("free space was not looked at"), "{text}");
     assert!(told["fused"] == true && truth.local(&t_a_b(&told)).amax() < 0.01, "{told}");
 }
 

@@ -132,11 +132,29 @@ fn covariances_are_those_of_the_odometry_in_the_axes_of_the_body() {
         let mut turn = Matrix6::identity();
         turn.fixed_view_mut::<3, 3>(0, 0).copy_from(&r);
         turn.fixed_view_mut::<3, 3>(3, 3).copy_from(&r);
-        let fixed = Matrix6::from_diagonal(&[1e-4 * (1.0 + k), 0.04, 1e6, 1e6, 9999.0, 0.01].into());
+        let fixed = Matrix6::from_diagonal(&[1e-4 * (1.0 + k), 0.04, 1e6, 1e6, 1e6, 0.01].into());
         let want = turn * fixed * turn.transpose();
         let found = line.pose.covariance.matrix();
         assert!((found - want).amax() < 1e-6, "{found}{want}");
     }
+}
+
+/// Turned into the axes of a body that turns, one covariance for all poses would look like many.
+#[test]
+fn one_covariance_for_all_poses_is_no_chain_and_is_told() {
+    let data = tempfile::tempdir().unwrap();
+    let mut messages = ROBOT.drive(12.0);
+    for (k, message) in messages.iter_mut().filter(|message| message.topic == "/odom").enumerate() {
+        let mut odometry = ROBOT.odometry(f64::from(k as u32) / 20.0);
+        let c = &mut odometry.pose.covariance;
+        (c[0], c[7], c[14], c[21], c[28], c[35]) = (1e-3, 1e-2, 1e6, 1e6, 1e6, 1e-2);
+        *message = ROBOT.message("odom", f64::from(k as u32) / 20.0, &odometry);
+    }
+    mcap(&data.path().join("drive.mcap"), &messages);
+    let out = tempfile::tempdir().unwrap();
+    let Prepared { recordings, remarks } = import::prepare_bag(data.path(), out.path(), &Wanted::default()).unwrap();
+    assert_eq!(recordings[0].manifest().covariance_of, CovarianceOf::Motion);
+    assert!(remarks.iter().any(|told| told.contains("/odom states one covariance for all poses")), "{remarks:?}");
 }
 
 #[test]
@@ -152,8 +170,12 @@ fn what_is_wrong_names_the_bag_and_topics_belong_to_bags() {
     assert!(error.contains("drive.mcap: is no bag"), "{error}");
     let error = import::detect(out.path()).unwrap_err().to_string();
     assert!(error.contains("ROS bags (*.mcap, *.db3, *.bag)"), "{error}");
-    fs::remove_file(&path).unwrap();
     fs::write(data.path().join("a.clf"), "").unwrap();
+    let error = import::detect(data.path()).unwrap_err().to_string();
+    assert!(error.contains("holds a ROS bag, drive.mcap, and a laser's log, a.clf"), "{error}");
+    let error = import::detect(&data.path().join("a.clf")).unwrap_err().to_string();
+    assert!(error.contains("a.clf: one file alone is read if it is a ROS bag"), "{error}");
+    fs::remove_file(&path).unwrap();
     let wanted = Wanted { odometry: Some("/odom".into()), cloud: None };
     let error = import::prepare_topics(data.path(), out.path(), 1, &wanted).unwrap_err().to_string();
     assert!(error.contains("this is no ROS bag; --odometry and --cloud"), "{error}");

@@ -241,6 +241,14 @@ pub enum Problem {
     /// Clouds and poses of a bag do not come together.
     #[error("{0}")]
     Join(Box<JoinError>),
+    /// The same, of a bag that cannot be read in full.
+    #[error("{error} (of what can be read: {told})")]
+    Damaged {
+        /// Why.
+        error: Box<JoinError>,
+        /// What is damaged.
+        told: String,
+    },
     /// A folder holds nothing that can be fed to robots.
     #[error("{0}")]
     Data(String),

@@ -45,6 +45,11 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     if folder.is_file() && kind_of(folder).is_some() {
         return Ok(Kind::Bags);
     }
+    if folder.is_file() {
+        let why =
+            "one file alone is read if it is a ROS bag (.mcap, .db3, .bag); of all else give the folder that holds it";
+        return Err(Problem::Data(why.into()).of(folder));
+    }
     let entries = on(folder, folder.read_dir())?;
     let mut names: Vec<String> = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into()).collect();
     names.sort();
@@ -65,11 +70,19 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     if any(&|name| import_mrclam::robot(name).is_some()) {
         return Ok(Kind::Mrclam);
     }
-    if !bags_in(folder)?.is_empty() {
-        return Ok(Kind::Bags);
-    }
-    if !import_laser::logs(&names.iter().map(String::as_str).collect::<Vec<_>>()).is_empty() {
-        return Ok(Kind::Carmen);
+    let logs = import_laser::logs(&names.iter().map(String::as_str).collect::<Vec<_>>());
+    match (bags_in(folder)?.first(), logs.first()) {
+        // Any program may have left a file.log beside its bag.
+        (Some(bag), Some(log)) if import_laser::is_surely_log(log) => {
+            let why = format!(
+                "holds a ROS bag, {}, and a laser's log, {log}: give the bag itself, or a folder of one kind",
+                bag.file_name().unwrap_or_default().to_string_lossy()
+            );
+            return Err(Problem::Data(why).of(folder));
+        }
+        (Some(_), _) => return Ok(Kind::Bags),
+        (None, Some(_)) => return Ok(Kind::Carmen),
+        (None, None) => {}
     }
     let why = format!(
         "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \

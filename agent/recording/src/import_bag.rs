@@ -9,10 +9,10 @@ use super::deal::{Deal, deal};
 use super::error::{Problem, RecordingError, on};
 use super::import::ROBOTS_MAX;
 use super::import_laser::planar;
-use super::unmeasured::marked_unmeasured;
+use super::unmeasured::of_body;
 use crate::manifest::{CloudFormat, FORMAT, Manifest, VERSION};
 use merganser_protocol::config::{Config, Sensor};
-use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3, So3};
+use merganser_protocol::geometry::{Covariance, CovarianceError, PoseWithCovariance, Se3};
 use merganser_protocol::ids::{NAME_LEN_MAX, Name};
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::Stamp;
@@ -26,6 +26,10 @@ use std::path::{Path, PathBuf};
 pub(super) const ROBOTS: usize = 3;
 /// Clouds that reach farther are taken for a LiDAR's, m.
 const CAMERA_REACH_M: f64 = 10.0;
+/// Points of a cloud that tells what kind of sensor it is: the first ones of one that warms up hold none, or a few.
+const TELLING_MIN: usize = 64;
+/// Points of a planar laser lie in a plane to this, m: what single precision leaves of a scan.
+const FLAT_M: f32 = 1e-3;
 /// Side of the cubes in which a reach is counted, m: sensors see most points near.
 const CELL_M: f64 = 0.25;
 /// A keyframe of a LiDAR is taken after this way, m, or this turn, rad...
@@ -73,6 +77,10 @@ pub(super) fn import(
     for bag in &opened {
         let told = |error: JoinError| of_bag(bag, error);
         let choices = choose(bag.topics(), wanted).map_err(told)?;
+        if sources.len() + choices.len() > ROBOTS_MAX {
+            let why = format!("more than {ROBOTS_MAX} robots; choose some by --odometry and --cloud");
+            return Err(Problem::Data(why).of(bag.path()));
+        }
         let robots = gather(bag, &choices).map_err(told)?;
         remarks.extend(bag.damage().told().into_iter().map(|told| about(bag, &told)));
         let begins = robots.iter().filter_map(|joined| joined.clouds.first()).map(|first| first.stamp_ns).min();
@@ -81,10 +89,6 @@ pub(super) fn import(
             let name = joined.choice.namespace.clone().unwrap_or_else(|| stem(bag.path()));
             let name = unused(&name, sources.iter().map(|source| source.name.as_str()));
             sources.push(Source { bag, joined, name, begins });
-        }
-        if sources.len() > ROBOTS_MAX {
-            let why = format!("more than {ROBOTS_MAX} robots; choose some by --odometry and --cloud");
-            return Err(Problem::Data(why).of(bag.path()));
         }
     }
     for source in &sources {
@@ -104,7 +108,14 @@ fn about(bag: &Bag, told: &str) -> String {
 fn of_bag(bag: &Bag, error: JoinError) -> RecordingError {
     match error {
         JoinError::Bag(error) => error.into(),
-        error => Problem::Join(Box::new(error)).of(bag.path()),
+        error => {
+            let error = Box::new(error);
+            match bag.damage().told().join("; ") {
+                told if told.is_empty() => Problem::Join(error),
+                told => Problem::Damaged { error, told },
+            }
+            .of(bag.path())
+        }
     }
 }
 
@@ -148,8 +159,7 @@ impl Profile {
     fn of_cloud(placed: &Placed) -> Self {
         let mut config = Config::default();
         config.submap.keyframes_max = 10;
-        let first = placed.points.first().map_or(0.0, |point| point[2]);
-        if placed.points.iter().all(|point| (point[2] - first).abs() < 1e-3) {
+        if is_flat(placed) {
             return Self::laser();
         }
         if reach(placed) <= CAMERA_REACH_M {
@@ -169,6 +179,12 @@ impl Profile {
         *distance = distance.min((way / SUBMAPS_PER_ROBOT).max(least));
         self
     }
+}
+
+/// Whether all points lie at one height of the body, as those of a planar laser do.
+fn is_flat(placed: &Placed) -> bool {
+    let first = placed.points.first().map_or(0.0, |point| point[2]);
+    placed.points.iter().all(|point| (point[2] - first).abs() < FLAT_M)
 }
 
 /// How far the body went, m.
@@ -193,7 +209,7 @@ fn reach(placed: &Placed) -> f64 {
 }
 
 impl Source<'_> {
-    /// By the first cloud that can be used.
+    /// By the first cloud with points enough to tell; else by the first that can be used.
     fn profile(&self) -> Result<Profile, RecordingError> {
         if self.joined.is_planar {
             return Ok(Profile::laser());
@@ -203,8 +219,11 @@ impl Source<'_> {
             self.bag,
             |_| true,
             |_, _, placed| -> Result<Flow, JoinError> {
-                profile = Some(Profile::of_cloud(&placed));
-                Ok(Flow::Stop)
+                let is_telling = placed.points.len() >= TELLING_MIN;
+                if is_telling || profile.is_none() {
+                    profile = Some(Profile::of_cloud(&placed));
+                }
+                Ok(if is_telling { Flow::Stop } else { Flow::On })
             },
         );
         looked.map_err(|error| of_bag(self.bag, error))?;
@@ -274,6 +293,12 @@ impl Source<'_> {
                  so, which is generous; let the driver state pose.covariance",
                 self.joined.poses
             ));
+        } else if counts.iter().any(|counts| counts.is_constant) {
+            remarks.push(format!(
+                "{} states one covariance for all poses, which says nothing of any motion: motions count as known to \
+                 what drives so, which is generous; let the driver state a pose.covariance that grows along the way",
+                self.joined.poses
+            ));
         }
         remarks
     }
@@ -301,6 +326,8 @@ struct Counts {
     keyframes: usize,
     /// Keyframes whose odometry states no covariance that can be one.
     unstated: usize,
+    /// Whether it states one for all poses.
+    is_constant: bool,
 }
 
 /// A recording that is being made.
@@ -311,7 +338,7 @@ struct Recorder<'a> {
     joined: &'a Joined,
     /// Which of [`Joined::clouds`] are keyframes.
     chosen: BTreeSet<usize>,
-    /// Whether the odometry states covariances of all of them.
+    /// Whether the odometry states covariances of all of them, and not always the same.
     is_stated: bool,
     last: Option<Se3>,
     counts: Counts,
@@ -334,6 +361,9 @@ impl<'a> Recorder<'a> {
         let joined = &source.joined;
         let chosen = apart(&joined.clouds, given, profile.step);
         let unstated = chosen.iter().filter(|index| stated(joined, &joined.clouds[**index]).is_none()).count();
+        // One for all poses does not grow along the way, and is no chain; turned into the body's axes it would look
+        // like one.
+        let is_constant = joined.covariances.len() == 1 && chosen.len() > 1;
         let origin = format!(
             "ROS bag {}: {} (frame of the body: {}) by {}{how}",
             source.bag.path().file_name().unwrap_or_default().to_string_lossy(),
@@ -356,8 +386,9 @@ impl<'a> Recorder<'a> {
             config: profile.config.clone(),
         };
         let writer = Writer::create(&folder, manifest)?;
-        let counts = Counts { keyframes: 0, unstated };
-        Ok(Self { writer, folder, profile, joined, is_stated: unstated == 0, chosen, last: None, counts })
+        let counts = Counts { keyframes: 0, unstated, is_constant };
+        let is_stated = unstated == 0 && !is_constant;
+        Ok(Self { writer, folder, profile, joined, is_stated, chosen, last: None, counts })
     }
 
     fn push(&mut self, posed: &Posed, points: &[[f32; 3]]) -> Result<(), RecordingError> {
@@ -413,17 +444,9 @@ fn apart(clouds: &[Posed], given: impl Iterator<Item = usize>, (way, turn): (f64
     chosen
 }
 
-/// The covariance of the body's pose, if the odometry states one.
+/// The covariance of the body's pose, if the odometry states one. ROS states perturbations along and about the axes of
+/// the odometry's frame, we along and about those of the body.
 fn stated(joined: &Joined, posed: &Posed) -> Option<Covariance<6>> {
     let stated = joined.covariances.get(posed.covariance?)?;
-    Covariance::new(local(&marked_unmeasured(Matrix6::from_row_slice(stated)), &posed.pose.rotation)).ok()
-}
-
-/// ROS states perturbations along and about the axes of the odometry's frame, we along and about those of the body.
-fn local(fixed: &Matrix6<f64>, t_odom_body: &So3) -> Matrix6<f64> {
-    let mut turn = Matrix6::zeros();
-    let r = t_odom_body.matrix().transpose();
-    turn.fixed_view_mut::<3, 3>(0, 0).copy_from(&r);
-    turn.fixed_view_mut::<3, 3>(3, 3).copy_from(&r);
-    turn * fixed * turn.transpose()
+    Covariance::new(of_body(&Matrix6::from_row_slice(stated), &posed.pose.rotation)).ok()
 }

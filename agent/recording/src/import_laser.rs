@@ -53,6 +53,11 @@ pub(super) fn logs<'a>(names: &[&'a str]) -> Vec<&'a str> {
     if sure.is_empty() { ending(&LOOSE_SUFFIXES) } else { sure }
 }
 
+/// Whether a name is that of a laser's log and of nothing else.
+pub(super) fn is_surely_log(name: &str) -> bool {
+    SUFFIXES.iter().any(|suffix| name.ends_with(suffix))
+}
+
 /// Writes three recordings into `out`, and returns what there is to say of the log.
 pub(super) fn import(data: &Path, out: &Path) -> Result<Vec<String>, RecordingError> {
     let mut names = Vec::new();

@@ -30,9 +30,16 @@ pub(super) fn json(bytes: &[u8], error: &serde_json::Error) -> ObservationError 
     ObservationError::Json(one_line(&told))
 }
 
-/// Names of fields are the sender's: what is told of them is one line, and not as long as they like.
+/// Names of fields are the sender's: what is told of them is one line, and not as long as they like. Of a longer one the
+/// beginning is told and the end, where the cure stands.
 fn one_line(told: &str) -> String {
-    told.chars().map(|c| if c.is_control() { ' ' } else { c }).take(TOLD_MAX).collect()
+    let breaks = |c: char| c.is_control() || matches!(c, '\u{2028}' | '\u{2029}');
+    let line: Vec<char> = told.chars().map(|c| if breaks(c) { ' ' } else { c }).collect();
+    if line.len() <= TOLD_MAX {
+        return line.into_iter().collect();
+    }
+    let half = (TOLD_MAX - 1) / 2;
+    line[..half].iter().chain(&['…']).chain(&line[line.len() - half..]).collect()
 }
 
 /// Whether bytes that were sent as postcard are JSON.

@@ -33,7 +33,7 @@ pub struct AlignArgs {
     #[arg(long, value_name = "metric|unknown", value_parser = scale)]
     pub scale: Option<ScaleKind>,
     /// Clouds are made of several views, or their sensor was not at their origin: nothing is concluded from what it must
-    /// have looked through, so that places that look alike are told apart less often. Surfaces are still taken to face the
+    /// have looked through (a recording knows it), so that places that look alike are told apart less often. Surfaces are still taken to face the
     /// origin: it must lie on the side from which most of both were seen, or else within them.
     #[arg(long)]
     pub fused: bool,
@@ -109,6 +109,9 @@ struct Outcome {
 pub fn run(args: &AlignArgs) -> Result<bool> {
     let picture = args.picture.as_ref().map(|path| ending(path).map(|png| (path, png))).transpose()?;
     let sources = [side::read(&args.a, args)?, side::read(&args.b, args)?];
+    if args.fused && !sources.iter().any(side::Source::is_cloud) {
+        return Err(BadInput::told("--fused is for clouds; a recording knows what its sensor saw from where"));
+    }
     let config = side::config(&sources, args)?;
     let [a, b] = sources;
     let sides = [a.describe(&config, args.fused)?, b.describe(&config, args.fused)?];

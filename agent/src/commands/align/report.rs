@@ -7,6 +7,7 @@ use merganser_protocol::agent::job::Refused;
 use merganser_protocol::geometry::Relative;
 use merganser_protocol::kinds::RefusalReason;
 use merganser_protocol::snapshot::RelationView;
+use merganser_protocol::submap::RegisterConfig;
 use merganser_protocol::wire::fact::ScaleKind;
 use nalgebra::Vector3;
 use serde_json::{Value, json};
@@ -68,6 +69,9 @@ pub(super) fn text(outcome: &Outcome) -> String {
                 found.sigma,
                 -found.log10_nfa
             );
+            if outcome.fused {
+                text += "\n    free space was not looked at (--fused): it tells no places apart that look alike";
+            }
             if let Relative::Similarity(t) = &found.t_mine_theirs {
                 let sigma = t.covariance.matrix()[(6, 6)].sqrt();
                 let _ = write!(
@@ -141,9 +145,9 @@ fn sigmas(t_a_b: &Relative) -> [f64; 6] {
 /// What a refusal means, and what to try. That points would stand where a sensor looked through is no reason against a
 /// pose of clouds which were not seen from their origin, and nothing in a cloud tells that.
 fn advice(outcome: &Outcome, refused: &Refused) -> (&'static str, &'static str) {
-    let is_seen_through = ["contradiction", "seen to be free"].iter().any(|word| refused.why.contains(word));
+    let has_unseen = !outcome.fused && outcome.sides.iter().any(|side| side.is_cloud);
     match words(refused.not.reason) {
-        (what, _) if is_seen_through && !outcome.fused => (
+        (what, _) if has_unseen && is_seen_through(&refused.why) => (
             what,
             "try: --fused, if a cloud is made of several views or its sensor was not at its origin: points stand where, \
              seen from the origin, the other cloud shows free space. Else: do they overlap by a third? Is --sensor \
@@ -151,6 +155,12 @@ fn advice(outcome: &Outcome, refused: &Refused) -> (&'static str, &'static str) 
         ),
         words => words,
     }
+}
+
+/// Whether free space is what a refusal names, or more of what it names than passes.
+fn is_seen_through(why: &str) -> bool {
+    let share = why.rsplit_once("contradiction ").and_then(|(_, share)| share.parse::<f64>().ok());
+    why.contains("seen to be free") || share.is_some_and(|share| share > RegisterConfig::default().contradiction_max)
 }
 
 fn words(reason: RefusalReason) -> (&'static str, &'static str) {
@@ -210,5 +220,19 @@ pub(super) fn scene(outcome: &Outcome) -> Scene {
         robots: robots.collect(),
         alignments: Vec::new(),
         in_metres: outcome.config.submap.scale == ScaleKind::Metric,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_seen_through;
+    use merganser_protocol::submap::RegisterError;
+
+    #[test]
+    fn free_space_is_named_as_the_reason_only_where_it_is() {
+        let refused = |contradiction| RegisterError::NoConsensus { poses: 9, score: 10.0, fit: 0.1, contradiction };
+        assert!(is_seen_through(&refused(0.07).to_string()));
+        assert!(!is_seen_through(&refused(0.05).to_string()), "score and fit are too low");
+        assert!(!is_seen_through("two poses with scores 90 and 88: the place looks like another"));
     }
 }

@@ -44,6 +44,8 @@ enum What {
 /// A described submap.
 pub(super) struct Side {
     pub name: String,
+    /// A cloud, of which nothing tells where it was seen from.
+    pub is_cloud: bool,
     /// Points read, and left after thinning.
     pub points: [usize; 2],
     /// 90 % of the surface is nearer to the anchor, m.
@@ -174,13 +176,19 @@ fn range<'a>(points: impl Iterator<Item = &'a [f32; 3]> + Clone) -> f64 {
 }
 
 impl Source {
+    /// Whether it is no submap of a recording, which knows what its sensor saw from where.
+    pub(super) fn is_cloud(&self) -> bool {
+        matches!(self.what, What::Cloud(..))
+    }
+
     /// Cuts and describes it.
     pub(super) fn describe(self, config: &Config, fused: bool) -> Result<Side> {
+        let is_cloud = self.is_cloud();
         let (mut submap, read) = match self.what {
             What::Cloud(points, marks) => of_cloud(&self.name, points, marks, config)?,
             What::Recording(recording, number) => of_recording(&self.name, &recording, number, config)?,
         };
-        if fused {
+        if fused && is_cloud {
             // Of no point is known who saw it: nobody looked through anything, and surfaces face the origin.
             submap.seen_from.fill(u16::MAX);
         }
@@ -204,6 +212,7 @@ impl Source {
         let cloud: Vec<Vector3<f64>> = submap.cloud.iter().map(|p| Vector3::from(p.map(f64::from))).collect();
         Ok(Side {
             name: self.name,
+            is_cloud,
             points: [read, cloud.len()],
             range: range(submap.cloud.iter()),
             cloud,
