@@ -6,5 +6,6 @@ pub mod bag;
 pub mod join;
 pub mod limits;
 pub mod msg;
+mod order;
 pub mod tf;
 pub mod wire;

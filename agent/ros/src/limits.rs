@@ -18,13 +18,17 @@ pub const FRAMES_MAX: usize = 4_096;
 pub const TRANSFORMS_MAX: usize = 2_000_000;
 /// Transforms of a link by which another may come late.
 pub const LATE_MAX: usize = 1_000;
+/// How far a stamp may lie before the newest that was received, ns: more is a clock that was set back.
+pub const REORDER_NS_MAX: i64 = 1_000_000_000;
+/// Bytes of a frame's name at most.
+pub const FRAME_BYTES_MAX: usize = 256;
 /// Transforms between a cloud and the body at most.
 pub const CHAIN_MAX: usize = 64;
 /// Poses of one odometry at most: five hours at 50 Hz.
 pub const POSES_MAX: usize = 1_000_000;
 /// Clouds of one robot at most, of which keyframes are chosen: 27 hours at 10 Hz.
 pub const CLOUDS_MAX: usize = 1_000_000;
-/// Frames that the clouds of one topic are in at most.
+/// Pairs of frames (of odometry and body) that one topic names and that are told apart, at most.
 pub const CLOUD_FRAMES_MAX: usize = 64;
 /// Points of a cloud at most, measured or not.
 pub const POINTS_MAX: usize = 1_000_000;

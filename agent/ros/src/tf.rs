@@ -6,8 +6,9 @@
 //! base_footprint` beside `base_link → base_footprint`): the shortest way between two frames is taken. A loop, in
 //! which a frame would lie in itself, is refused link by link.
 
-use crate::limits::{CHAIN_MAX, FRAMES_MAX, GAP_SECS_MAX, LATE_MAX, TRANSFORMS_MAX};
+use crate::limits::{CHAIN_MAX, FRAME_BYTES_MAX, FRAMES_MAX, GAP_SECS_MAX, LATE_MAX, TRANSFORMS_MAX};
 use crate::msg::{TfMessage, TransformStamped, plain_frame};
+use crate::order::{Order, Turn};
 use merganser_geometry::Se3;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use thiserror::Error;
@@ -84,6 +85,25 @@ pub enum TfError {
         /// The child.
         child: String,
     },
+    /// The transform's stamp lies before that of an earlier one.
+    #[error("{parent} → {child}: the clock was set back, or the bag loops; left out")]
+    Back {
+        /// The parent.
+        parent: String,
+        /// The child.
+        child: String,
+    },
+    /// A transform's stamp lay far ahead of the ones before and after.
+    #[error("{parent} → {child}: a stamp lies far ahead of those before and after it; left out")]
+    Ahead {
+        /// The parent.
+        parent: String,
+        /// The child.
+        child: String,
+    },
+    /// The name of a frame is too long.
+    #[error("a frame's name has {0} bytes; at most {FRAME_BYTES_MAX} (FRAME_BYTES_MAX) are read")]
+    Long(usize),
     /// Too many frames.
     #[error("more than {FRAMES_MAX} links between frames (FRAMES_MAX)")]
     Frames,
@@ -103,6 +123,9 @@ struct Link {
     samples: Vec<(i64, Se3)>,
     /// Whether a sample differs from the first.
     moves: bool,
+    order: Order,
+    /// Whether the last sample came by moving the one before along.
+    is_moved_along: bool,
 }
 
 /// Transforms between frames.
@@ -113,6 +136,8 @@ pub struct TfTree {
     /// Frames that are connected, both ways.
     beside: BTreeMap<String, BTreeSet<String>>,
     transforms: usize,
+    /// Links that were refused, as they would close a loop, and the loop: links never go, and so neither does it.
+    loops: BTreeMap<(String, String), String>,
     /// Transforms that were not taken, by the reason.
     refused: BTreeMap<String, u64>,
 }
@@ -125,15 +150,16 @@ impl TfTree {
     pub fn take(&mut self, message: &TfMessage, is_fixed: bool) {
         for transform in &message.transforms {
             if let Err(error) = self.insert(transform, is_fixed) {
-                let reason = error.to_string();
-                let reason = if self.refused.len() < REASONS_MAX || self.refused.contains_key(&reason) {
-                    reason
-                } else {
-                    "other reasons".into()
-                };
-                *self.refused.entry(reason).or_default() += 1;
+                self.refuse(&error);
             }
         }
+    }
+
+    fn refuse(&mut self, error: &TfError) {
+        let reason = error.to_string();
+        let is_told = self.refused.len() < REASONS_MAX || self.refused.contains_key(&reason);
+        let reason = if is_told { reason } else { "other reasons".into() };
+        *self.refused.entry(reason).or_default() += 1;
     }
 
     /// Transforms that were not taken, by the reason.
@@ -148,6 +174,9 @@ impl TfTree {
     pub fn insert(&mut self, transform: &TransformStamped, is_fixed: bool) -> Result<(), TfError> {
         let (parent, child) = (transform.header.frame(), plain_frame(&transform.child_frame_id));
         let names = || (parent.to_owned(), child.to_owned());
+        if let Some(long) = [parent, child].map(str::len).into_iter().find(|bytes| *bytes > FRAME_BYTES_MAX) {
+            return Err(TfError::Long(long));
+        }
         if parent.is_empty() || child.is_empty() || parent == child {
             let (parent, child) = names();
             return Err(TfError::Names { parent, child });
@@ -158,11 +187,16 @@ impl TfTree {
         };
         let key = names();
         if !self.links.contains_key(&key) {
-            if self.links.len() == FRAMES_MAX {
+            if let Some(told) = self.loops.get(&key) {
+                return Err(TfError::Loop(told.clone()));
+            }
+            if self.links.len() == FRAMES_MAX || self.loops.len() == FRAMES_MAX {
                 return Err(TfError::Frames);
             }
             if let Some(chain) = self.down(child, parent) {
-                return Err(TfError::Loop(format!("{} → {child}", chain.join(" → "))));
+                let told = told_chain(&chain, child);
+                self.loops.insert(key, told.clone());
+                return Err(TfError::Loop(told));
             }
         }
         if self.transforms >= TRANSFORMS_MAX {
@@ -176,26 +210,36 @@ impl TfTree {
         let stamp = transform.header.stamp_ns;
         let link = self.links.entry(key).or_default();
         let before = link.samples.len();
-        if !link.take(stamp, pose, is_fixed) {
-            let (parent, child) = names();
-            return Err(TfError::Late { parent, child });
+        let taken = link.take(stamp, pose, is_fixed);
+        self.transforms = (self.transforms + link.samples.len()).saturating_sub(before);
+        let (parent, child) = names();
+        match taken {
+            Taken::Whole => Ok(()),
+            Taken::Late => Err(TfError::Late { parent, child }),
+            Taken::Back => Err(TfError::Back { parent, child }),
+            // It is the one before that is left out.
+            Taken::Instead => {
+                self.refuse(&TfError::Ahead { parent, child });
+                Ok(())
+            }
         }
-        self.transforms += link.samples.len() - before;
-        Ok(())
     }
 
     /// The frames from `top` down to `frame`, if it lies in it.
-    fn down(&self, top: &str, frame: &str) -> Option<Vec<String>> {
-        let mut met = BTreeSet::from([top.to_owned()]);
-        let mut chains = vec![vec![top.to_owned()]];
-        while let Some(chain) = chains.pop() {
-            let last = chain.last()?;
+    fn down<'a>(&'a self, top: &'a str, frame: &str) -> Option<Vec<&'a str>> {
+        let mut parents: BTreeMap<&str, &str> = BTreeMap::from([(top, top)]);
+        let mut next = vec![top];
+        while let Some(last) = next.pop() {
             if last == frame {
+                let up = |frame: &&'a str| parents.get(frame).copied().filter(|parent| parent != frame);
+                let mut chain: Vec<&str> = std::iter::successors(Some(last), up).collect();
+                chain.reverse();
                 return Some(chain);
             }
             for child in self.beside.get(last).into_iter().flatten() {
-                if self.links.contains_key(&(last.clone(), child.clone())) && met.insert(child.clone()) {
-                    chains.push(chain.iter().chain([child]).cloned().collect());
+                if !parents.contains_key(child.as_str()) && self.links.contains_key(&(last.to_owned(), child.clone())) {
+                    parents.insert(child, last);
+                    next.push(child);
                 }
             }
         }
@@ -303,15 +347,46 @@ impl TfTree {
     }
 }
 
+/// What became of a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Taken {
+    Whole,
+    /// It comes too late.
+    Late,
+    /// The clock was set back.
+    Back,
+    /// In the place of the one before, whose stamp lay far ahead.
+    Instead,
+}
+
+/// Frames of a loop, for people.
+fn told_chain(chain: &[&str], top: &str) -> String {
+    const TOLD: usize = 12;
+    let (told, rest) = chain.split_at(chain.len().min(TOLD));
+    let more = if rest.is_empty() { String::new() } else { format!(" → … ({} more)", rest.len()) };
+    format!("{}{more} → {top}", told.join(" → "))
+}
+
 impl Link {
-    /// Takes a sample; false if it comes too late.
-    fn take(&mut self, stamp_ns: i64, pose: Se3, is_fixed: bool) -> bool {
+    fn take(&mut self, stamp_ns: i64, pose: Se3, is_fixed: bool) -> Taken {
         if is_fixed {
             self.fixed = Some(pose);
-            return true;
+            return Taken::Whole;
+        }
+        let mut taken = Taken::Whole;
+        match self.order.take(stamp_ns) {
+            Turn::On => {}
+            Turn::Back => return Taken::Back,
+            Turn::Alone(before_ns) => {
+                taken = Taken::Instead;
+                match self.samples.last_mut() {
+                    Some((last_ns, _)) if self.is_moved_along => *last_ns = before_ns,
+                    _ => drop(self.samples.pop()),
+                }
+            }
         }
         if self.samples.iter().rev().nth(LATE_MAX).is_some_and(|(other, _)| stamp_ns < *other) {
-            return false;
+            return Taken::Late;
         }
         self.moves |= self.samples.first().is_some_and(|(_, first)| *first != pose);
         // While it rests the last sample moves along.
@@ -321,14 +396,16 @@ impl Link {
             && *last_ns < stamp_ns
         {
             *last_ns = stamp_ns;
-            return true;
+            self.is_moved_along = true;
+            return taken;
         }
+        self.is_moved_along = false;
         let at = self.samples.partition_point(|(other, _)| *other < stamp_ns);
         match self.samples.get_mut(at) {
             Some((same, there)) if *same == stamp_ns => *there = pose,
             _ => self.samples.insert(at, (stamp_ns, pose)),
         }
-        true
+        taken
     }
 
     fn at(&self, at_ns: i64) -> Result<Se3, When> {

@@ -124,6 +124,8 @@ pub struct Damage {
     pub long: u64,
     /// Messages of no topic, or that could not be unpacked.
     pub lost: u64,
+    /// What there is to tell of its files beside.
+    pub noted: Vec<String>,
 }
 
 /// A bag, whose topics are known.
@@ -137,13 +139,13 @@ pub struct Bag {
 }
 
 impl Bag {
-    /// Opens the bag at `path`, a file or a folder with `metadata.yaml`, and counts its messages, for which it is
+    /// Opens the bag at `path`, a file, a folder, or the name of one that was split ([`bags_in`]), and counts its messages, for which it is
     /// read once.
     ///
     /// # Errors
     /// [`BagError`].
     pub fn open(path: &Path) -> Result<Self, BagError> {
-        let (kind, files) = files::of_bag(path)?;
+        let files::Files { kind, files, noted } = files::of_bag(path)?;
         let mut bag = Self { path: path.into(), kind, files, topics: Vec::new(), damage: Damage::default() };
         let mut topics = Topics::default();
         let mut counts: BTreeMap<usize, u64> = BTreeMap::new();
@@ -151,6 +153,7 @@ impl Bag {
             *counts.entry(record.topic).or_default() += 1;
             Flow::On
         })?;
+        bag.damage.noted = noted;
         bag.topics = topics.list;
         for (topic, count) in counts {
             if let Some(topic) = bag.topics.get_mut(topic) {
@@ -175,7 +178,8 @@ impl Bag {
         &self.damage
     }
 
-    /// Gives each message of the topics for which `wanted` says so (by their index) to `each`, file by file.
+    /// Gives each message of the topics for which `wanted` says so (by their index) to `each`, file by file, and
+    /// returns what could not be read on the way; [`Damage::beyond`] tells what of it [`Bag::damage`] did not say.
     ///
     /// # Errors
     /// [`BagError`].
@@ -183,10 +187,10 @@ impl Bag {
         &self,
         wanted: impl Fn(usize) -> bool,
         mut each: impl FnMut(Record<'_>) -> Flow,
-    ) -> Result<(), BagError> {
+    ) -> Result<Damage, BagError> {
         let mut topics = Topics { list: self.topics.clone() };
         let passed = |record: Record<'_>| if wanted(record.topic) { each(record) } else { Flow::On };
-        self.scan(&mut topics, false, &mut { passed }).map(drop)
+        self.scan(&mut topics, false, &mut { passed })
     }
 
     fn scan(
@@ -243,6 +247,17 @@ impl Damage {
         self.stopped.push(format!("{name}: {why}"));
     }
 
+    /// What of this an earlier reading of the same bag did not find.
+    pub fn beyond(&self, earlier: &Self) -> Self {
+        Self {
+            stopped: self.stopped.iter().filter(|why| !earlier.stopped.contains(why)).cloned().collect(),
+            untold: self.untold.saturating_sub(earlier.untold),
+            long: self.long.saturating_sub(earlier.long),
+            lost: self.lost.saturating_sub(earlier.lost),
+            noted: self.noted.iter().filter(|note| !earlier.noted.contains(note)).cloned().collect(),
+        }
+    }
+
     /// A sentence for each.
     pub fn told(&self) -> Vec<String> {
         let mut told: Vec<String> =
@@ -256,6 +271,7 @@ impl Damage {
         if self.lost > 0 {
             told.push(format!("{} messages of no known topic, or that cannot be unpacked, are left out", self.lost));
         }
+        told.extend(self.noted.iter().cloned());
         told
     }
 }

@@ -25,15 +25,34 @@ pub(super) fn scan(
     let bag = open(path).map_err(|problem| problem.of(path))?;
     let known = read_topics(&bag, topics).map_err(|problem| problem.of(path))?;
     let result = if counts { count(&bag, &known, damage, each) } else { messages(&bag, &known, damage, each) };
-    match result {
-        Ok(flow) => Ok(flow),
+    result.map_err(|error| BagProblem::Sqlite(error.to_string()).of(path)).map(|end| match end {
+        End::Flow(flow) => flow,
         // A file that was cut is read as far as its pages go.
-        Err(rusqlite::Error::SqliteFailure(error, _)) if error.code == rusqlite::ErrorCode::DatabaseCorrupt => {
+        End::Corrupt => {
             damage.stop(path, "the database is damaged or was cut off");
-            Ok(Flow::On)
+            Flow::On
         }
-        Err(error) => Err(BagProblem::Sqlite(error.to_string()).of(path)),
-    }
+        End::Unordered => {
+            damage.stop(
+                path,
+                "the index of stamps is damaged; messages are read in the order in which they were written",
+            );
+            Flow::On
+        }
+    })
+}
+
+/// How a reading ended.
+enum End {
+    Flow(Flow),
+    /// At a page that cannot be read.
+    Corrupt,
+    /// The index by which messages are put in order cannot be read; all messages could be.
+    Unordered,
+}
+
+fn is_corrupt(error: &rusqlite::Error) -> bool {
+    error.sqlite_error_code() == Some(rusqlite::ErrorCode::DatabaseCorrupt)
 }
 
 /// Opens it so that nothing is written, not even beside it, unless the recorder left a journal to be played.
@@ -47,7 +66,9 @@ fn open(path: &Path) -> Result<Connection, BagProblem> {
     let bag = Connection::open_with_flags(uri, flags).map_err(told)?;
     bag.set_limit(Limit::SQLITE_LIMIT_LENGTH, MESSAGE_BYTES_MAX as i32 + ROW_BYTES).map_err(told)?;
     bag.set_limit(Limit::SQLITE_LIMIT_ATTACHED, 0).map_err(told)?;
-    bag.execute_batch("PRAGMA trusted_schema = OFF; PRAGMA query_only = ON;").map_err(told)?;
+    // SQLite refuses a file that is shorter than it states as a whole, unless the schema might be mended; ours is not.
+    bag.execute_batch("PRAGMA trusted_schema = OFF; PRAGMA query_only = ON; PRAGMA writable_schema = ON;")
+        .map_err(told)?;
     // A view may never end.
     for table in ["topics", "messages"] {
         let real = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = ?1 AND sql LIKE 'CREATE TABLE%'";
@@ -82,31 +103,77 @@ fn count(
     known: &BTreeMap<i64, usize>,
     damage: &mut Damage,
     each: &mut dyn FnMut(Record<'_>) -> Flow,
-) -> rusqlite::Result<Flow> {
+) -> rusqlite::Result<End> {
     let mut statement = bag.prepare("SELECT topic_id, timestamp FROM messages")?;
     let mut rows = statement.query([])?;
-    while let Some(row) = rows.next()? {
+    loop {
+        let row = match rows.next() {
+            Ok(Some(row)) => row,
+            Ok(None) => return Ok(End::Flow(Flow::On)),
+            Err(error) if is_corrupt(&error) => return Ok(End::Corrupt),
+            Err(error) => return Err(error),
+        };
         let (id, received_ns): (i64, i64) = (row.get(0)?, row.get(1)?);
         match known.get(&id) {
             Some(topic) => drop(each(Record { topic: *topic, received_ns, bytes: &[] })),
             None => damage.lost += 1,
         }
     }
-    Ok(Flow::On)
 }
 
+/// Every message by its stamp; if the index of stamps is damaged, those that are left in the order of their numbers.
 fn messages(
     bag: &Connection,
     known: &BTreeMap<i64, usize>,
     damage: &mut Damage,
     each: &mut dyn FnMut(Record<'_>) -> Flow,
-) -> rusqlite::Result<Flow> {
-    let mut statement = bag.prepare("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id")?;
+) -> rusqlite::Result<End> {
+    let mut given = Given::default();
+    match ordered(bag, "timestamp, id", known, damage, &mut given, each)? {
+        End::Corrupt => match ordered(bag, "id", known, damage, &mut given, each)? {
+            End::Flow(Flow::On) => Ok(End::Unordered),
+            other => Ok(other),
+        },
+        other => Ok(other),
+    }
+}
+
+/// Every message that is not yet given.
+fn ordered(
+    bag: &Connection,
+    by: &str,
+    known: &BTreeMap<i64, usize>,
+    damage: &mut Damage,
+    given: &mut Given,
+    each: &mut dyn FnMut(Record<'_>) -> Flow,
+) -> rusqlite::Result<End> {
+    // SQLite refuses a row that is longer than it may take, and with it all that follow: its length is read alone.
+    let select = format!(
+        "SELECT id, topic_id, timestamp, length(data), CASE WHEN length(data) <= {MESSAGE_BYTES_MAX} THEN data END \
+         FROM messages ORDER BY {by}"
+    );
+    let mut statement = match bag.prepare(&select) {
+        Err(error) if is_corrupt(&error) => return Ok(End::Corrupt),
+        statement => statement?,
+    };
     let mut rows = statement.query([])?;
     let mut unpacked = Vec::new();
-    while let Some(row) = rows.next()? {
-        let (id, received_ns): (i64, i64) = (row.get(0)?, row.get(1)?);
-        let (Some(topic), ValueRef::Blob(mut bytes)) = (known.get(&id), row.get_ref(2)?) else {
+    loop {
+        let row = match rows.next() {
+            Ok(Some(row)) => row,
+            Ok(None) => return Ok(End::Flow(Flow::On)),
+            Err(error) if is_corrupt(&error) => return Ok(End::Corrupt),
+            Err(error) => return Err(error),
+        };
+        let (number, id, received_ns): (i64, i64, i64) = (row.get(0)?, row.get(1)?, row.get(2)?);
+        if !given.insert(number) {
+            continue;
+        }
+        if row.get::<_, Option<i64>>(3)?.is_some_and(|length| length > MESSAGE_BYTES_MAX as i64) {
+            damage.long += 1;
+            continue;
+        }
+        let (Some(topic), ValueRef::Blob(mut bytes)) = (known.get(&id), row.get_ref(4)?) else {
             damage.lost += 1;
             continue;
         };
@@ -125,8 +192,40 @@ fn messages(
             continue;
         }
         if each(Record { topic: *topic, received_ns, bytes }) == Flow::Stop {
-            return Ok(Flow::Stop);
+            return Ok(End::Flow(Flow::Stop));
         }
     }
-    Ok(Flow::On)
 }
+
+/// Numbers of messages that were given, as ranges: recorders count up, so that there are few.
+#[derive(Default)]
+struct Given {
+    /// First by last.
+    ranges: BTreeMap<i64, i64>,
+}
+
+impl Given {
+    /// Takes a number; false if it is there.
+    fn insert(&mut self, number: i64) -> bool {
+        let (mut first, mut last) = (number, number);
+        if let Some((&to, &from)) = self.ranges.range(number..).next() {
+            if from <= number {
+                return false;
+            }
+            if from.checked_sub(1) == Some(number) {
+                self.ranges.remove(&to);
+                last = to;
+            }
+        }
+        if let Some(before) = number.checked_sub(1)
+            && let Some(from) = self.ranges.remove(&before)
+        {
+            first = from;
+        }
+        self.ranges.insert(last, first);
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -168,6 +168,79 @@ fn a_folder_with_metadata_is_one_bag_of_all_its_files() {
     assert!(error.contains("unpack it by `zstd -d --rm run_3.db3.zstd`"), "{error}");
 }
 
+fn told(path: &Path) -> (Vec<Written>, Vec<String>) {
+    let (bag, messages) = read(path).unwrap();
+    (messages, bag.damage().told())
+}
+
+/// A recorder that was killed leaves no metadata.yaml.
+#[test]
+fn a_split_bag_without_metadata_is_one_bag_and_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let (parts, path) = (drive(true), |name: &str| folder.path().join(name));
+    for (k, part) in parts.chunks(5).enumerate() {
+        mcap(&path(&format!("run.1_{k}.mcap")), part, None, true, "cdr");
+    }
+    for robot in 1..3 {
+        db3(&path(&format!("robot_{robot}.db3")), &parts, false, false);
+    }
+    let bags = super::bags_in(folder.path()).unwrap();
+    assert_eq!(bags, ["robot_1.db3", "robot_2.db3", "run.1.mcap"].map(path), "parts are counted from 0 on");
+    let (messages, remarks) = told(&bags[2]);
+    assert_eq!(messages, plain(parts.clone()));
+    assert!(remarks[0].starts_with("run.1_0.mcap to run.1_9.mcap (10 files) are taken for one bag"), "{remarks:?}");
+    assert!(told(&bags[0]).1.is_empty() && told(&path("run.1_3.mcap")).1.is_empty(), "a file that is named is one bag");
+    fs::remove_file(path("run.1_4.mcap")).unwrap();
+    assert_eq!(super::bags_in(folder.path()).unwrap().len(), 2 + 9, "one is missing");
+    assert!(read(&path("run.1.mcap")).unwrap_err().to_string().contains("No such file"));
+}
+
+#[test]
+fn folders_of_bags_without_metadata_are_bags_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    for within in ["one", "two", "three", "other"] {
+        fs::create_dir(path(within)).unwrap();
+    }
+    fs::write(path("one/metadata.yaml"), "  relative_file_paths:\n    - one_0.db3\n").unwrap();
+    for name in ["one/one_0.db3", "two/two_0.db3", "two/two_1.db3", "three/a.db3", "three/b.db3"] {
+        db3(&path(name), &drive(true), false, false);
+    }
+    fs::write(path("other/image.png"), "").unwrap();
+    let bags = super::bags_in(folder.path()).unwrap();
+    assert_eq!(bags, ["one", "three/a.db3", "three/b.db3", "two"].map(path));
+    let (messages, remarks) = told(&bags[3]);
+    assert!(messages.len() == 100 && remarks[0].contains("two_0.db3 to two_1.db3 (2 files)"), "{remarks:?}");
+}
+
+#[test]
+fn the_files_that_metadata_names_are_read_alone_and_in_that_order() {
+    let folder = tempfile::tempdir().unwrap();
+    let (parts, path) = (drive(true), |name: &str| folder.path().join(name));
+    for (name, part) in ["b", "a", "c"].iter().zip(parts.chunks(20)) {
+        db3(&path(&format!("{name}.db3")), part, false, false);
+    }
+    fs::write(path("metadata.yaml"), "relative_file_paths:\n  - run/b.db3\n  - a.db3\n  - a.db3\n").unwrap();
+    let (messages, remarks) = told(folder.path());
+    assert_eq!(messages, plain(parts[..40].to_vec()));
+    assert!(remarks.len() == 1 && remarks[0].contains("does not name 1 of the files beside it (c.db3)"), "{remarks:?}");
+}
+
+#[test]
+fn a_file_that_is_packed_as_a_whole_is_a_bag_and_refused_with_the_cure() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    for (name, kind) in [("a.mcap.zstd", super::Kind::Mcap), ("b.db3.zst", super::Kind::Sqlite)] {
+        fs::write(path(name), "").unwrap();
+        assert_eq!(super::kind_of(&path(name)), Some(kind));
+        let error = read(&path(name)).unwrap_err().to_string();
+        assert!(error.contains(&format!("unpack it by `zstd -d --rm {name}`")), "{error}");
+    }
+    mcap(&path("a.mcap"), &drive(true), None, true, "cdr");
+    assert_eq!(super::bags_in(folder.path()).unwrap(), ["a.mcap", "b.db3.zst"].map(path), "a.mcap is unpacked already");
+    assert_eq!(super::kind_of(&path("a.tar.zst")), None);
+}
+
 #[test]
 fn what_is_no_bag_is_told() {
     let folder = tempfile::tempdir().unwrap();

@@ -73,12 +73,17 @@ pub fn choose(topics: &[Topic], wanted: &Wanted) -> Result<Vec<Choice>, JoinErro
             Ok(vec![choice(topics, None, Poses::Tf, *cloud)])
         }
         ([odometry], [cloud]) => Ok(vec![choice(topics, None, poses(topics, *odometry), *cloud)]),
-        _ => by_namespace(topics, &odometries, &clouds),
+        _ => by_namespace(topics, &odometries, &clouds, wanted),
     }
 }
 
 /// One robot for each namespace that has one of both, if that is all there is.
-fn by_namespace(topics: &[Topic], odometries: &[usize], clouds: &[usize]) -> Result<Vec<Choice>, JoinError> {
+fn by_namespace(
+    topics: &[Topic],
+    odometries: &[usize],
+    clouds: &[usize],
+    wanted: &Wanted,
+) -> Result<Vec<Choice>, JoinError> {
     let mut robots: BTreeMap<&str, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
     for index in odometries {
         robots.entry(namespace(&topics[*index].name)).or_default().0.push(*index);
@@ -94,12 +99,12 @@ fn by_namespace(topics: &[Topic], odometries: &[usize], clouds: &[usize]) -> Res
     };
     let several = |of: &[usize], what, option| {
         let list = listed(of.iter().map(|index| &topics[*index]));
-        let hint = if robots.len() > 1 && robots.keys().all(|name| !name.is_empty()) {
-            let last = topics[of[0]].name.rsplit('/').next().unwrap_or_default();
-            format!(", or that of each robot without its namespace: {option} {last}")
-        } else {
-            String::new()
-        };
+        // What was said once and did not suffice is not said again.
+        let said = if option == CLOUD { &wanted.cloud } else { &wanted.odometry };
+        let is_said = said.as_ref().is_some_and(|name| !name.starts_with('/'));
+        let hint = relative(topics, of, &robots)
+            .filter(|_| !is_said)
+            .map_or_else(String::new, |name| format!(", or that of each robot without its namespace: {option} {name}"));
         JoinError::Several { count: of.len(), what, list, option, hint }
     };
     match robots.iter().map(whole).collect::<Option<Vec<_>>>() {
@@ -110,6 +115,23 @@ fn by_namespace(topics: &[Topic], odometries: &[usize], clouds: &[usize]) -> Res
         _ if clouds.len() > 1 => Err(several(clouds, "sensor_msgs/PointCloud2 or LaserScan", CLOUD)),
         _ => Err(several(odometries, "nav_msgs/Odometry", ODOMETRY)),
     }
+}
+
+/// A name that means one of these topics for each robot.
+fn relative<'a, T>(topics: &'a [Topic], of: &[usize], robots: &BTreeMap<&str, T>) -> Option<&'a str> {
+    if robots.len() < 2 || robots.contains_key("") {
+        return None;
+    }
+    let name = |index: &usize| topics[*index].name.as_str();
+    let inner = |index: &usize| Some(name(index).trim_start_matches('/').split_once('/')?.1);
+    of.iter().filter_map(inner).find(|inner| {
+        let found: Vec<&str> = of.iter().map(name).filter(|name| ends_with(name, inner)).map(namespace).collect();
+        found.len() == robots.len() && robots.keys().all(|robot| found.contains(robot))
+    })
+}
+
+fn ends_with(topic: &str, relative: &str) -> bool {
+    topic.strip_suffix(relative).is_some_and(|rest| rest.is_empty() || rest.ends_with('/'))
 }
 
 fn one_each<T>(robots: &BTreeMap<&str, T>, count: impl Fn(&T) -> usize) -> bool {
@@ -140,7 +162,7 @@ fn named(
 ) -> Result<Vec<usize>, JoinError> {
     let is_named = |topic: &Topic| match name.starts_with('/') {
         true => topic.name == name,
-        false => topic.name.strip_suffix(name).is_some_and(|rest| rest.is_empty() || rest.ends_with('/')),
+        false => ends_with(&topic.name, name),
     };
     let found: Vec<usize> =
         topics.iter().enumerate().filter(|(_, topic)| is_named(topic)).map(|(index, _)| index).collect();

@@ -1,11 +1,12 @@
 //! One reading of a bag for poses, transforms and stamps of clouds.
 
 use super::{Choice, JoinError, Poses, Tally, listed};
-use crate::bag::{Bag, Flow, Record};
-use crate::limits::{CLOUD_FRAMES_MAX, CLOUDS_MAX, GAP_SECS_MAX, POSES_MAX};
+use crate::bag::{Bag, Damage, Flow, Record};
+use crate::limits::{CLOUD_FRAMES_MAX, CLOUDS_MAX, FRAME_BYTES_MAX, GAP_SECS_MAX, POSES_MAX};
 use crate::msg::{
     Header, LaserScan, Odometry, PointCloud2, Pose, PoseStamped, PoseWithCovarianceStamped, TfMessage, plain_frame,
 };
+use crate::order::{Order, Turn};
 use crate::tf::{TfTree, When, interpolated};
 use crate::wire::{CDR_HEADER_LEN, Field as _, Message, Ros1Reader, Serialization, WireError};
 use hiroz_cdr::{BigEndian, CdrReader, LittleEndian};
@@ -57,10 +58,15 @@ pub struct Joined {
     /// What was passed over.
     pub tally: Tally,
     pub(super) serialization: Serialization,
+    /// What of the bag could not be read for these, beyond what its opening told.
+    pub(super) damage: Damage,
 }
 
 /// A pose, and the number of its covariance.
 type Sample = (Se3, Option<usize>);
+
+/// A pose as it came: stamp, time of receipt, which pair of frames.
+type Received = (i64, i64, usize, Sample);
 
 /// Poses in rising order of their stamps, with the frames of odometry and body, and where they come from.
 type Way = (Vec<(i64, Sample)>, String, String, String);
@@ -68,11 +74,9 @@ type Way = (Vec<(i64, Sample)>, String, String, String);
 /// What is read of one robot.
 struct Gathering<'a> {
     choice: &'a Choice,
-    /// Stamp, time of receipt, pose.
-    poses: Vec<(i64, i64, Sample)>,
+    poses: Vec<Received>,
     covariances: Vec<[f64; 36]>,
-    odom: BTreeSet<String>,
-    body: BTreeSet<String>,
+    frames: Frames,
     /// Stamp, time of receipt.
     clouds: Vec<(i64, i64)>,
     tree: TfTree,
@@ -90,13 +94,19 @@ pub fn gather(bag: &Bag, choices: &[Choice]) -> Result<Vec<Joined>, JoinError> {
     let mut robots: Vec<Gathering<'_>> = choices.iter().map(Gathering::of).collect();
     let wanted: BTreeSet<usize> = choices.iter().flat_map(Choice::topics).collect();
     let topics = bag.topics();
-    bag.read(
+    let damage = bag.read(
         |topic| wanted.contains(&topic),
         |record| {
             let Some(topic) = topics.get(record.topic) else { return Flow::On };
             let Some(serialization) = topic.serialization else { return Flow::On };
             let mut flow = Flow::On;
+            // One /tf may be that of many robots.
+            let is_tf = robots.iter().any(|robot| robot.choice.is_fixed(record.topic).is_some());
+            let transforms = is_tf.then(|| TfMessage::decode(serialization, record.bytes));
             for robot in &mut robots {
+                if let (Some(is_fixed), Some(transforms)) = (robot.choice.is_fixed(record.topic), &transforms) {
+                    robot.take_tf(transforms, is_fixed, &topic.name);
+                }
                 if let Err(error) = robot.take(serialization, &topic.kind, &topic.name, record) {
                     robot.error = Some(error);
                     flow = Flow::Stop;
@@ -105,10 +115,21 @@ pub fn gather(bag: &Bag, choices: &[Choice]) -> Result<Vec<Joined>, JoinError> {
             flow
         },
     )?;
-    robots.into_iter().map(|robot| robot.finish(bag)).collect()
+    let damage = damage.beyond(bag.damage());
+    let mut joined = robots.into_iter().map(|robot| robot.finish(bag, &damage)).collect::<Result<Vec<_>, _>>()?;
+    // It is that of the bag, and so it is told once.
+    if let Some(first) = joined.first_mut() {
+        damage.told().iter().for_each(|told| first.tally.count(told));
+    }
+    Ok(joined)
 }
 
 impl Choice {
+    /// Whether the topic's transforms are for all time; none if they are not those of this robot.
+    fn is_fixed(&self, topic: usize) -> Option<bool> {
+        self.tf.iter().find(|(index, _)| *index == topic).map(|(_, is_fixed)| *is_fixed)
+    }
+
     /// All topics of the robot.
     fn topics(&self) -> impl Iterator<Item = usize> + '_ {
         let poses = match self.poses {
@@ -125,8 +146,7 @@ impl<'a> Gathering<'a> {
             choice,
             poses: Vec::new(),
             covariances: Vec::new(),
-            odom: BTreeSet::new(),
-            body: BTreeSet::new(),
+            frames: Frames::default(),
             clouds: Vec::new(),
             tree: TfTree::default(),
             tally: Tally::default(),
@@ -136,6 +156,14 @@ impl<'a> Gathering<'a> {
         }
     }
 
+    fn take_tf(&mut self, transforms: &Result<TfMessage, WireError>, is_fixed: bool, name: &str) {
+        match transforms {
+            Ok(message) => self.tree.take(message, is_fixed),
+            Err(error) => self.tally.count(format!("{name}: {error}")),
+        }
+    }
+
+    /// Takes what is no transform.
     fn take(
         &mut self,
         serialization: Serialization,
@@ -143,12 +171,6 @@ impl<'a> Gathering<'a> {
         name: &str,
         Record { topic, received_ns, bytes }: Record<'_>,
     ) -> Result<(), JoinError> {
-        if let Some((_, is_fixed)) = self.choice.tf.iter().find(|(index, _)| *index == topic) {
-            match TfMessage::decode(serialization, bytes) {
-                Ok(message) => self.tree.take(&message, *is_fixed),
-                Err(error) => self.tally.count(format!("{name}: {error}")),
-            }
-        }
         if self.choice.cloud == topic {
             if self.clouds.len() == CLOUDS_MAX {
                 return Err(JoinError::Clouds(name.into()));
@@ -171,15 +193,20 @@ impl<'a> Gathering<'a> {
                 Ok(Stated { header, body, pose, covariance }) => match pose.se3() {
                     None => self.poses_bad.count("a number is not finite or too large, or the quaternion is zero"),
                     Some(pose) => {
-                        name_frame(&mut self.odom, header.frame());
-                        name_frame(&mut self.body, plain_frame(&body));
+                        let frames = match self.frames.index(header.frame(), plain_frame(&body)) {
+                            Ok(frames) => frames,
+                            Err(why) => {
+                                self.poses_bad.count(why);
+                                return Ok(());
+                            }
+                        };
                         let covariance = covariance.map(|stated| {
                             if self.covariances.last() != Some(&stated) {
                                 self.covariances.push(stated);
                             }
                             self.covariances.len() - 1
                         });
-                        self.poses.push((header.stamp_ns, received_ns, (pose, covariance)));
+                        self.poses.push((header.stamp_ns, received_ns, frames, (pose, covariance)));
                     }
                 },
             }
@@ -187,7 +214,7 @@ impl<'a> Gathering<'a> {
         Ok(())
     }
 
-    fn finish(mut self, bag: &Bag) -> Result<Joined, JoinError> {
+    fn finish(mut self, bag: &Bag, damage: &Damage) -> Result<Joined, JoinError> {
         if let Some(error) = self.error {
             return Err(error);
         }
@@ -203,10 +230,9 @@ impl<'a> Gathering<'a> {
                     let why = self.poses_bad.commonest().unwrap_or("there are none").into();
                     return Err(JoinError::Unusable { topic: source.name.clone(), count: source.count, why });
                 }
-                let samples = stamped(std::mem::take(&mut self.poses), &source.name, &mut self.tally);
-                let odom = one(&self.odom, ODOM, &source.name, &mut self.tally);
-                let body = one(&self.body, BODY, &source.name, &mut self.tally);
-                (samples, odom, body, source.name.clone())
+                let poses = std::mem::take(&mut self.poses);
+                let (poses, odom, body) = self.frames.commonest(poses, &source.name, &mut self.tally);
+                (stamped(poses, &source.name, &mut self.tally), odom, body, source.name.clone())
             }
             None => self.of_tf().ok_or_else(|| {
                 JoinError::NoPoses(format!("frames {}, and topics {}", self.tree.known(), listed(topics)))
@@ -231,6 +257,7 @@ impl<'a> Gathering<'a> {
             tree: self.tree,
             tally: self.tally,
             serialization: topic.serialization.unwrap_or(Serialization::Cdr),
+            damage: damage.clone(),
         })
     }
 
@@ -281,9 +308,10 @@ impl<'a> Gathering<'a> {
                 self.tally.count(format!("{name}: left out, as the stamp does not come after the one before"));
                 continue;
             }
-            last = stamp_ns;
             match interpolated(poses, stamp_ns, |(pose, _)| *pose) {
                 Ok(pose) => {
+                    // A cloud without a pose, as one stamped in the future, says nothing of those that follow.
+                    last = stamp_ns;
                     let covariance = nearest(poses, stamp_ns).and_then(|(_, covariance)| *covariance);
                     clouds.push(Posed { number: number as u64, stamp_ns, pose, covariance });
                 }
@@ -315,21 +343,38 @@ impl<'a> Gathering<'a> {
 
 /// Stands for a cloud that cannot be read.
 const UNREAD: i64 = i64::MIN;
+const UNNAMED: &str = "names no body; taken for that of base_link, so the sensor's mounting on it is applied";
 const CLOCKLESS: &str = "taken by the time of receipt, as all stamps are 0";
 
 /// Poses in rising order of their stamps.
-fn stamped(poses: Vec<(i64, i64, Sample)>, name: &str, tally: &mut Tally) -> Vec<(i64, Sample)> {
+fn stamped(poses: Vec<Received>, name: &str, tally: &mut Tally) -> Vec<(i64, Sample)> {
     let is_clockless = poses.iter().all(|(stamp, ..)| *stamp == 0);
     let mut samples: Vec<(i64, Sample)> = Vec::with_capacity(poses.len());
-    for (stamp, received, sample) in poses {
-        match stamp {
+    let mut order = Order::default();
+    for (stamp, received, _, sample) in poses {
+        let at = match stamp {
             0 if is_clockless => {
                 tally.count(format!("{name}: {CLOCKLESS}"));
-                samples.push((received, sample));
+                received
             }
-            0 => tally.count(format!("{name}: left out, as the stamp is 0")),
-            stamp => samples.push((stamp, sample)),
+            0 => {
+                tally.count(format!("{name}: left out, as the stamp is 0"));
+                continue;
+            }
+            stamp => stamp,
+        };
+        match order.take(at) {
+            Turn::On => {}
+            Turn::Back => {
+                tally.count(format!("{name}: the clock was set back, or the bag loops; left out"));
+                continue;
+            }
+            Turn::Alone(_) => {
+                tally.count(format!("{name}: left out, as the stamp lies far ahead of those before and after it"));
+                samples.pop();
+            }
         }
+        samples.push((at, sample));
     }
     samples.sort_by_key(|(stamp, _)| *stamp);
     let all = samples.len();
@@ -346,22 +391,56 @@ fn nearest(poses: &[(i64, Sample)], at_ns: i64) -> Option<&Sample> {
     around.min_by_key(|(stamp, _)| stamp.abs_diff(at_ns)).map(|(_, sample)| sample)
 }
 
-/// Frames are few, and are only told.
-fn name_frame(frames: &mut BTreeSet<String>, frame: &str) {
-    if !frames.contains(frame) && frames.len() < CLOUD_FRAMES_MAX {
-        frames.insert(frame.into());
-    }
+/// Pairs of frames that one topic names, with how many messages name them.
+#[derive(Default)]
+struct Frames {
+    pairs: Vec<(String, String, usize)>,
+    /// Messages that name no body.
+    unnamed: u64,
 }
 
-/// The one frame that a topic names; told if there are others.
-fn one(frames: &BTreeSet<String>, default: &str, topic: &str, tally: &mut Tally) -> String {
-    let mut named = frames.iter().filter(|frame| !frame.is_empty());
-    let Some(first) = named.next() else { return default.into() };
-    if named.next().is_some() {
-        let all: Vec<&str> = frames.iter().map(String::as_str).take(8).collect();
-        tally.count(format!("{topic}: names several frames ({}); {first} is taken", all.join(", ")));
+impl Frames {
+    /// The number of a pair; why there is none.
+    fn index(&mut self, odom: &str, body: &str) -> Result<usize, String> {
+        if let Some(long) = [odom, body].map(str::len).into_iter().find(|bytes| *bytes > FRAME_BYTES_MAX) {
+            return Err(format!(
+                "a frame's name has {long} bytes; at most {FRAME_BYTES_MAX} (FRAME_BYTES_MAX) are read"
+            ));
+        }
+        self.unnamed += u64::from(body.is_empty());
+        let odom = if odom.is_empty() { ODOM } else { odom };
+        let body = if body.is_empty() { BODY } else { body };
+        let found = self.pairs.iter().position(|(a, b, _)| a == odom && b == body);
+        if found.is_none() && self.pairs.len() == CLOUD_FRAMES_MAX {
+            return Err(format!("names more than {CLOUD_FRAMES_MAX} pairs of frames (CLOUD_FRAMES_MAX)"));
+        }
+        let index = found.unwrap_or(self.pairs.len());
+        match self.pairs.get_mut(index) {
+            Some((.., count)) => *count += 1,
+            None => self.pairs.push((odom.into(), body.into(), 1)),
+        }
+        Ok(index)
     }
-    first.clone()
+
+    /// The poses in the frames that most are in (the first of several), and these; what is left out is told.
+    fn commonest(&self, mut poses: Vec<Received>, topic: &str, tally: &mut Tally) -> (Vec<Received>, String, String) {
+        if self.unnamed > 0 {
+            tally.add(format!("{topic}: {UNNAMED}"), self.unnamed);
+        }
+        let most = self.pairs.iter().map(|(.., count)| *count).max();
+        let found = self.pairs.iter().enumerate().find(|(_, (.., count))| Some(*count) == most);
+        let Some((index, (odom, body, _))) = found else { return (poses, ODOM.into(), BODY.into()) };
+        let all = poses.len();
+        poses.retain(|(_, _, frames, _)| *frames == index);
+        if poses.len() < all {
+            let others = self.pairs.iter().enumerate().filter(|(other, _)| *other != index).take(8);
+            let others: Vec<String> = others.map(|(_, (odom, body, _))| format!("{odom} → {body}")).collect();
+            let others = others.join(", ");
+            let why = format!("{topic}: left out, as they are of other frames ({others}) than most, {odom} → {body}");
+            tally.add(why, (all - poses.len()) as u64);
+        }
+        (poses, odom.clone(), body.clone())
+    }
 }
 
 /// What a message says of the body.

@@ -69,7 +69,7 @@ impl Joined {
         if let Some(error) = failed {
             return Err(error);
         }
-        result.map_err(|error| E::from(JoinError::Bag(error)))?;
+        let damage = result.map_err(|error| E::from(JoinError::Bag(error)))?;
         if used == 0 {
             let (cloud, body) = (self.cloud.clone(), self.body.clone());
             if let Some(why) = unplaced.commonest() {
@@ -80,6 +80,9 @@ impl Joined {
         }
         for (why, count) in unplaced.reasons() {
             bad.add(format!("cannot be put into the body's frame: {why}"), count);
+        }
+        for told in damage.beyond(bag.damage()).beyond(&self.damage).told() {
+            bad.count(told);
         }
         Ok(bad)
     }

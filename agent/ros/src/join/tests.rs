@@ -112,6 +112,7 @@ fn poses_without_a_body_are_those_of_base_link() {
     let robots = joined(&bag, &named("/slam/pose", "")).unwrap();
     assert!(off_walls(&bag, &robots[0]).0 < 2e-4);
     assert_eq!(robots[0].choice.poses, Poses::Stamped(1));
+    assert_eq!(counted(&robots[0].tally, "/slam/pose: names no body; taken for that of base_link"), 100);
 }
 
 #[test]
@@ -137,9 +138,10 @@ fn robots_are_told_apart_by_their_namespaces() {
     }
     let why = told(&messages, &Wanted::default());
     assert!(why.contains("4 topics are sensor_msgs/PointCloud2 or LaserScan"), "{why}");
+    assert!(why.ends_with("or that of each robot without its namespace: --cloud rear/scan"), "{why}");
     let (four, _folder) = bag(&messages);
     let ambiguous = joined(&four, &named("odom", "scan")).unwrap_err().to_string();
-    assert!(ambiguous.contains("name one by --cloud"), "{ambiguous}");
+    assert!(ambiguous.ends_with("name one by --cloud"), "no hint that was followed already: {ambiguous}");
     assert_eq!(joined(&four, &named("odom", "rear/scan")).unwrap().len(), 2, "relative names are those of each robot");
 }
 
@@ -241,6 +243,74 @@ fn clocks_that_are_wrong_are_told() {
         }
     }));
     assert_eq!((robot.clouds.len(), counted(&robot.tally, "does not come after")), (36, 4));
+}
+
+/// A bag that loops, or an NTP step: the second way is not mixed with the first.
+#[test]
+fn a_clock_set_back_leaves_out_what_follows_and_is_told() {
+    type Odometry = crate::msg::Odometry;
+    let second = Robot { phase: 2.0, ..ROBOT };
+    let mut messages = restamped("/odom", |k, odom: &mut Odometry| {
+        if k >= 50 {
+            let secs = f64::from(k as u32 - 50) / 20.0 + 0.01;
+            *odom = second.odometry(secs);
+        }
+    });
+    let (robot, bag, _folder) = one(&messages);
+    assert_eq!(counted(&robot.tally, "/odom: the clock was set back, or the bag loops; left out"), 30);
+    let (worst, count, _) = off_walls(&bag, &robot);
+    assert!(worst < 2e-4 && count == 25, "{worst} {count}");
+    // One stamp far ahead is left out alone.
+    messages = restamped("/odom", |k, odom: &mut Odometry| {
+        if k == 40 {
+            odom.header.stamp_ns += 1_000_000_000_000;
+        }
+    });
+    let (robot, ..) = one(&messages);
+    assert_eq!((robot.clouds.len(), counted(&robot.tally, "far ahead of those before and after")), (40, 1));
+    assert_eq!(robot.tally.sum(), 1, "{:?}", robot.tally);
+}
+
+#[test]
+fn a_cloud_stamped_in_the_future_is_left_out_alone() {
+    let (robot, ..) = one(&restamped("/scan", |k, scan: &mut crate::msg::LaserScan| {
+        if k == 3 {
+            scan.header.stamp_ns += 1_000_000_000_000;
+        }
+    }));
+    assert_eq!((robot.clouds.len(), robot.tally.sum()), (39, 1), "{:?}", robot.tally);
+}
+
+#[test]
+fn poses_in_other_frames_than_most_are_left_out_and_told() {
+    let second = Robot { phase: 2.0, ..ROBOT };
+    let (robot, bag, _folder) = one(&restamped("/odom", |k, odom: &mut crate::msg::Odometry| match k % 5 {
+        0 => {
+            *odom = second.odometry(f64::from(k as u32) / 20.0);
+            odom.header.frame_id = "a_map".into();
+        }
+        1 => odom.child_frame_id.clear(),
+        _ => {}
+    }));
+    assert_eq!(counted(&robot.tally, "other frames (a_map → base_link) than most, odom → base_link"), 16);
+    assert_eq!(counted(&robot.tally, "/odom: names no body; taken for that of base_link"), 16);
+    let (worst, count, _) = off_walls(&bag, &robot);
+    assert!(worst < 1e-3 && count == 39, "{worst} {count}");
+}
+
+#[test]
+fn transforms_for_all_are_those_of_each_robot() {
+    let robots = [Robot { namespace: "/r1", ..ROBOT }, Robot { namespace: "/r2", phase: 2.0, ..ROBOT }];
+    let mut messages: Vec<Written> = robots.iter().flat_map(|robot| robot.drive(5.0)).collect();
+    messages.retain(|message| !message.topic.ends_with("tf_static"));
+    messages.push(ROBOT.message("tf_static", 0.0, &ROBOT.sensor_pose()));
+    messages.push(Written { bytes: vec![9; 3], ..ROBOT.message("tf_static", 0.0, &ROBOT.sensor_pose()) });
+    messages.sort_by_key(|message| message.received_ns);
+    let (two, _folder) = bag(&messages);
+    for robot in joined(&two, &Wanted::default()).unwrap() {
+        assert_eq!(robot.tally.sum(), 1, "the one that cannot be read: {:?}", robot.tally);
+        assert!(off_walls(&two, &robot).0 < 2e-4);
+    }
 }
 
 #[test]
@@ -392,4 +462,19 @@ fn real_bags_are_read() {
         let tally = robots[0].read(&bag, |_| true, |_, _, _| -> Result<Flow, JoinError> { Ok(Flow::On) }).unwrap();
         assert_eq!(tally.sum(), 0, "{tally:?}");
     }
+}
+
+/// What is lost after the opening, which looks at no message's bytes, is told once.
+#[test]
+fn what_the_second_reading_of_a_bag_loses_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.db3");
+    write::db3(&path, &ROBOT.drive(4.0), false, false);
+    let long = crate::limits::MESSAGE_BYTES_MAX + (2 << 20);
+    let change = format!("UPDATE messages SET data = zeroblob({long}) WHERE id = 5");
+    rusqlite::Connection::open(&path).unwrap().execute_batch(&change).unwrap();
+    let bag = Bag::open(&path).unwrap();
+    let robots = joined(&bag, &Wanted::default()).unwrap();
+    assert_eq!(counted(&robots[0].tally, "1 messages of more than"), 1, "{:?}", robots[0].tally);
+    assert_eq!(off_walls(&bag, &robots[0]).2.sum(), 0);
 }

@@ -113,8 +113,8 @@ struct Coordinate {
 }
 
 impl PointCloud2 {
-    /// The points in the cloud's frame, m, and how many were left out for being not finite (nothing was measured) or
-    /// beyond [`COORDINATE_MAX`]. Of clouds of more than `kept_max` points every second, third… is read.
+    /// The points in the cloud's frame, m, and how many were left out for being not finite or the origin itself (both
+    /// are written where nothing was measured), or beyond [`COORDINATE_MAX`]. Of clouds of more than `kept_max` points every second, third… is read.
     ///
     /// # Errors
     /// [`CloudError`].
@@ -149,7 +149,7 @@ impl PointCloud2 {
             let (row, column) = (index / width as usize, index % width as usize);
             let at = row * row_step as usize + column * point_step as usize;
             let point = coordinates.map(|coordinate| self.number(at, coordinate));
-            if point.iter().all(|x| x.abs() <= COORDINATE_MAX) {
+            if point.iter().all(|x| x.abs() <= COORDINATE_MAX) && point != [0.0; 3] {
                 points.push(point);
             } else {
                 left_out += 1;

@@ -19,7 +19,7 @@ message! {
         scan_time: f32,
         /// Nearer ranges are none, m.
         range_min: f32,
-        /// Farther ranges are none, m.
+        /// This range and farther ones are none, m.
         range_max: f32,
         /// m; infinite or NaN where nothing was measured.
         ranges: Vec<f32>,
@@ -29,10 +29,10 @@ message! {
 }
 
 impl LaserScan {
-    /// What the rays hit, in the laser's frame, m; and how many rays hit nothing, or nothing between `range_min` and
-    /// `range_max`.
+    /// What the rays hit, in the laser's frame, m; and how many rays hit nothing, or nothing from `range_min` on and
+    /// below `range_max`: simulators report `range_max` itself where nothing was hit.
     pub fn points(&self) -> (Vec<[f64; 3]>, usize) {
-        let limits = self.range_min..=self.range_max;
+        let limits = self.range_min..self.range_max;
         let hit = |(ray, range): (usize, &f32)| {
             let angle = f64::from(self.angle_min) + ray as f64 * f64::from(self.angle_increment);
             let range =

@@ -158,6 +158,10 @@ fn points_that_are_none_are_counted() {
     assert_eq!((points, left_out), (vec![expected()[0], expected()[4], expected()[5]], 3));
     cloud.data.0[56..60].copy_from_slice(&1e7_f32.to_le_bytes());
     assert_eq!(cloud.points(usize::MAX).unwrap().1, 2, "the farthest that is taken");
+    cloud.data.0[64..76].fill(0);
+    assert_eq!(cloud.points(usize::MAX).unwrap().1, 3, "the origin itself is where nothing was measured");
+    cloud.data.0[72..76].copy_from_slice(&1e-6_f32.to_le_bytes());
+    assert_eq!(cloud.points(usize::MAX).unwrap().1, 2, "the nearest that is taken");
 }
 
 #[test]
@@ -171,11 +175,11 @@ fn rays_that_hit_nothing_are_counted() {
         scan_time: 0.0,
         range_min: 1.0,
         range_max: 4.0,
-        ranges: vec![1.0, 2.0, 0.5, 4.5, f32::NAN, f32::INFINITY, -2.0, 4.0],
+        ranges: vec![1.0, 2.0, 0.5, 4.5, f32::NAN, f32::INFINITY, -2.0, 4.0_f32.next_down(), 4.0],
         intensities: vec![],
     };
     let (points, missed) = scan.points();
-    assert_eq!(missed, 5);
+    assert_eq!(missed, 6, "range_max itself is no hit");
     let near = |point: [f64; 3], to: [f64; 3]| point.iter().zip(to).all(|(a, b)| (a - b).abs() < 1e-5);
     assert!(near(points[0], [1.0, 0.0, 0.0]) && near(points[1], [0.0, 2.0, 0.0]) && near(points[2], [0.0, -4.0, 0.0]));
     let endless = LaserScan { range_max: f32::INFINITY, angle_increment: f32::NAN, ..scan };

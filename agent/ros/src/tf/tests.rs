@@ -1,7 +1,7 @@
 //! The tree against chains that are known, loops and gaps.
 
 use super::{TfError, TfTree};
-use crate::limits::{CHAIN_MAX, FRAMES_MAX, LATE_MAX};
+use crate::limits::{CHAIN_MAX, FRAME_BYTES_MAX, FRAMES_MAX, LATE_MAX, REORDER_NS_MAX};
 use crate::msg::{Header, Quaternion, TfMessage, Transform, TransformStamped, Vector3};
 use merganser_geometry::Se3;
 use nalgebra::Vector6;
@@ -171,4 +171,60 @@ fn frames_chains_and_late_ones_are_bounded_on_both_sides() {
     (1..=LATE_MAX as i64 + 1).for_each(|k| tree.insert(&moving(10 * k), false).unwrap());
     assert!(matches!(tree.insert(&moving(9), false), Err(TfError::Late { .. })));
     assert!(tree.insert(&moving(11), false).is_ok());
+}
+
+/// A bag that loops: what comes the second time round is not mixed with the first.
+#[test]
+fn a_clock_set_back_is_left_out_of_its_link_alone() {
+    let mut tree = TfTree::default();
+    let moving = |k: i64, y: f64| link("odom", "base", k * REORDER_NS_MAX / 2, &pose(k as f64, y));
+    let round = |y: f64| TfMessage { transforms: (0..20).map(|k| moving(k, y)).collect() };
+    tree.take(&round(0.0), false);
+    tree.take(&round(0.7), false);
+    let back: Vec<_> = tree.refused().iter().collect();
+    assert_eq!(back, [(&"odom → base: the clock was set back, or the bag loops; left out".to_owned(), &20)]);
+    let at = |k: i64| tree.lookup("odom", "base", k * REORDER_NS_MAX / 2).unwrap();
+    assert!((0..20).all(|k| near(&at(k), &pose(k as f64, 0.0))));
+}
+
+#[test]
+fn a_stamp_far_ahead_does_not_shut_out_what_follows() {
+    for rests in [false, true] {
+        let at = |k: i64| pose(if rests { 0.0 } else { k as f64 }, 0.0);
+        let mut tree = TfTree::default();
+        for k in 0..40_i64 {
+            let stamp_ns = if k == 20 { 1000 * SEC } else { k * SEC / 10 };
+            tree.take(&TfMessage { transforms: vec![link("odom", "base", stamp_ns, &at(k))] }, false);
+        }
+        assert_eq!(tree.refused().values().sum::<u64>(), 1, "{:?}", tree.refused());
+        assert!(tree.refused().keys().all(|why| why.contains("far ahead")));
+        assert_eq!(tree.stamps("odom", "base").unwrap().last(), Some(39 * SEC / 10));
+        assert!(near(&tree.lookup("odom", "base", 39 * SEC / 10).unwrap(), &at(39)));
+        assert_eq!(tree.transforms, tree.links.values().map(|link| link.samples.len()).sum::<usize>());
+    }
+}
+
+#[test]
+fn names_are_bounded_on_both_sides() {
+    let mut tree = TfTree::default();
+    let long = "f".repeat(FRAME_BYTES_MAX);
+    assert!(tree.insert(&link("root", &long, 0, &pose(1.0, 0.0)), true).is_ok());
+    let error = tree.insert(&link("root", &(long + "f"), 0, &pose(1.0, 0.0)), true).unwrap_err();
+    assert_eq!(error, TfError::Long(FRAME_BYTES_MAX + 1));
+}
+
+/// Every link of a long chain back to its top is a loop: each is found once, however often it is said.
+#[test]
+fn a_long_chain_that_loops_again_and_again_is_told_shortly() {
+    let t = pose(1.0, 0.0);
+    let mut tree = TfTree::default();
+    for k in 1..FRAMES_MAX {
+        tree.insert(&link(&format!("f{}", k - 1), &format!("f{k}"), 0, &t), true).unwrap();
+    }
+    let last = format!("f{}", FRAMES_MAX - 1);
+    let closing = TfMessage { transforms: vec![link(&last, "f0", 0, &t)] };
+    (0..2_000).for_each(|_| tree.take(&closing, false));
+    let refused: Vec<_> = tree.refused().iter().collect();
+    assert_eq!((refused.len(), *refused[0].1, tree.loops.len()), (1, 2_000, 1));
+    assert!(refused[0].0.len() < 200 && refused[0].0.contains("f0 → f1 → f2"), "{refused:?}");
 }
