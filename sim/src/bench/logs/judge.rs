@@ -1,6 +1,6 @@
 //! What a play was worth, by the truth.
 
-use super::track::Track;
+use super::track::{Anchor, Track};
 use crate::wires::{Statement, Wires};
 use merganser_protocol::geometry::{PoseWithCovariance, Se3, chi2};
 use merganser_protocol::kinds::PairStatus;
@@ -55,6 +55,9 @@ pub struct Judged {
     pub alignments: [usize; 3],
     /// Of those agreed and those used, how many are false.
     pub falsely: [usize; 2],
+    /// Of the false ones that are used, how many are farther off than the 99.9 % that they claim. The others say of
+    /// themselves that they are vague.
+    pub beyond_claim: usize,
     /// Of those used, how many tie an anchor whose truth is not known.
     pub used_unjudged: usize,
     /// The false ones in words.
@@ -73,6 +76,23 @@ pub struct Judged {
     pub nees_anchors: Vec<f64>,
     /// Payload sent by all.
     pub bytes: u64,
+}
+
+/// How two anchors truly lie.
+struct Truth {
+    /// `t_i_j`.
+    pose: Se3,
+    /// Variances of what is not known of either anchor, m² and rad², beside those of all truth.
+    doubt: (f64, f64),
+}
+
+impl Truth {
+    /// What is not known of the first anchor's heading moves the second by as much times their distance.
+    fn between(i: &Anchor, j: &Anchor) -> Self {
+        let pose = i.t_world_anchor.inverse() * j.t_world_anchor;
+        let (of_i, of_j) = (i.doubt * i.doubt, j.doubt * j.doubt);
+        Self { doubt: (of_i * (1.0 + pose.translation.norm_squared()) + of_j, of_i + of_j), pose }
+    }
 }
 
 /// Judges a play.
@@ -115,7 +135,7 @@ impl Judge<'_> {
     }
 
     /// Where an anchor truly is, `name/epoch#index`.
-    fn anchor(&self, name: &str) -> Option<(usize, Se3)> {
+    fn anchor(&self, name: &str) -> Option<(usize, Anchor)> {
         let (frame, index) = name.rsplit_once('#')?;
         let robot = self.robot(frame)?;
         Some((robot, *self.tracks[robot].anchors.get(&index.parse().ok()?)?))
@@ -174,13 +194,13 @@ impl Judge<'_> {
                     let ends = pair.middle.as_ref().and_then(|middle| {
                         let (_, i) = self.anchor(&middle.i)?;
                         let (_, j) = self.anchor(&middle.j)?;
-                        Some((relation(&middle.t_i_j)?, i.inverse() * j))
+                        Some((relation(&middle.t_i_j)?, Truth::between(&i, &j)))
                     });
                     let Some((stated, truth)) = ends else {
                         judged.unjudged += 1;
                         continue;
                     };
-                    let (metres, degrees) = off(&stated.pose, &truth);
+                    let (metres, degrees) = off(&stated.pose, &truth.pose);
                     let (d2, dof) = self.distance_squared(&stated, &truth);
                     fate.worst_m = fate.worst_m.max(metres);
                     fate.worst_deg = fate.worst_deg.max(degrees);
@@ -204,16 +224,21 @@ impl Judge<'_> {
 
     fn alignments(&self, edges: &[EdgeView], judged: &mut Judged) {
         let error = |edge: &EdgeView| {
-            let ends = (self.anchor(&edge.i)?, self.anchor(&edge.j)?, pose(&edge.t_i_j.pose)?);
-            let ((_, i), (_, j), t) = ends;
-            Some(off(&t, &(i.inverse() * j)))
+            let ((_, i), (_, j)) = (self.anchor(&edge.i)?, self.anchor(&edge.j)?);
+            let truth = Truth::between(&i, &j);
+            // What makes no claim in metres has nothing to be vague by.
+            let excess = relation(&edge.t_i_j).map_or(f64::INFINITY, |stated| {
+                let (d2, dof) = self.distance_squared(&stated, &truth);
+                d2 / chi2::P999[dof - 1]
+            });
+            Some((off(&pose(&edge.t_i_j.pose)?, &truth.pose), excess))
         };
         for edge in edges.iter().filter(|edge| edge.kind == "alignment") {
             let (agreed, used) = (usize::from(edge.agreed), usize::from(edge.weight > 0.0));
             judged.alignments[0] += 1;
             judged.alignments[1] += agreed;
             judged.alignments[2] += used;
-            let Some((metres, degrees)) = error(edge) else {
+            let Some(((metres, degrees), excess)) = error(edge) else {
                 judged.used_unjudged += used;
                 continue;
             };
@@ -222,9 +247,12 @@ impl Judge<'_> {
             }
             judged.falsely[0] += agreed;
             judged.falsely[1] += used;
+            judged.beyond_claim += used * usize::from(excess > 1.0);
             if edge.agreed {
                 let fate = if edge.weight > 0.0 { "used" } else { &edge.reason };
-                judged.false_ones.push(format!("{} {}: {metres:.2} m, {degrees:.1} deg off; {fate}", edge.i, edge.j));
+                let of_claim = format!("{excess:.2} of the claimed 99.9 %");
+                let off = format!("{metres:.2} m, {degrees:.1} deg off, {of_claim}");
+                judged.false_ones.push(format!("{} {}: {off}; {fate}", edge.i, edge.j));
             }
         }
     }
@@ -233,32 +261,33 @@ impl Judge<'_> {
         for middle in view.frames.pairs.iter().filter_map(|pair| pair.middle.as_ref()) {
             let ends = (self.anchor(&middle.i), self.anchor(&middle.j), relation(&middle.t_i_j));
             let (Some((_, i)), Some((_, j)), Some(stated)) = ends else { continue };
-            let (d2, dof) = self.distance_squared(&stated, &(i.inverse() * j));
+            let (d2, dof) = self.distance_squared(&stated, &Truth::between(&i, &j));
             judged.nees_pairs.push(d2 / dof as f64);
         }
         let origin = view.map.submaps.iter().find_map(|submap| {
             let is_first = submap.frame == view.frames.own && submap.index == 0;
-            let (_, t_world_anchor) = self.anchor(&format!("{}#0", submap.frame)).filter(|_| is_first)?;
-            Some(t_world_anchor * pose(&submap.t_frame_anchor)?.inverse())
+            let (_, Anchor { t_world_anchor, doubt }) =
+                self.anchor(&format!("{}#0", submap.frame)).filter(|_| is_first)?;
+            Some(Anchor { t_world_anchor: t_world_anchor * pose(&submap.t_frame_anchor)?.inverse(), doubt })
         });
-        let Some(t_world_own) = origin else { return };
+        let Some(own) = origin else { return };
         for submap in &view.map.submaps {
             let Some((_, anchor)) = self.anchor(&format!("{}#{}", submap.frame, submap.index)) else { continue };
             let Some(stated) = submap.t_own_anchor.as_ref().and_then(relation) else { continue };
             // The first is where it is by definition.
             if submap.frame != view.frames.own || submap.index > 0 {
-                let (d2, dof) = self.distance_squared(&stated, &(t_world_own.inverse() * anchor));
+                let (d2, dof) = self.distance_squared(&stated, &Truth::between(&own, &anchor));
                 judged.nees_anchors.push(d2 / dof as f64);
             }
         }
     }
 
     /// Squared Mahalanobis distance of what is stated from the truth, and its degrees of freedom: three in the plane.
-    fn distance_squared(&self, stated: &PoseWithCovariance, truth: &Se3) -> (f64, usize) {
-        let error: Vector6<f64> = stated.pose.local(truth);
+    fn distance_squared(&self, stated: &PoseWithCovariance, truth: &Truth) -> (f64, usize) {
+        let error: Vector6<f64> = stated.pose.local(&truth.pose);
         let rows: &[usize] = if self.planar { &[0, 1, 5] } else { &[0, 1, 2, 3, 4, 5] };
         let (metres, turn) = self.truth;
-        let of_truth = |k: usize| if k < 3 { metres * metres } else { turn * turn };
+        let of_truth = |k: usize| if k < 3 { metres * metres + truth.doubt.0 } else { turn * turn + truth.doubt.1 };
         let covariance = DMatrix::from_fn(rows.len(), rows.len(), |r, c| {
             let own = if r == c { of_truth(rows[r]) } else { 0.0 };
             stated.covariance.matrix()[(rows[r], rows[c])] + own
@@ -308,7 +337,7 @@ mod tests {
                 raw: (0..30).map(at).collect(),
                 within: Vec::new(),
                 truth: (0..30).map(|k| Some(at(k))).collect(),
-                anchors: BTreeMap::from([(0, at(15))]),
+                anchors: BTreeMap::from([(0, Anchor { t_world_anchor: at(15), doubt: 0.0 })]),
             }
         };
         vec![track("a", 0.0), track("b", 10.0)]
@@ -383,8 +412,8 @@ mod tests {
     #[test]
     fn a_false_alignment_is_told_from_one_that_nobody_can_judge() {
         let (tracks, mut judged) = (tracks(), Judged::default());
-        let edge = |j: &str, off: f64| {
-            let covariance = Covariance::from_sigmas([0.1; 6]).unwrap();
+        let edge = |j: &str, off: f64, sigma: f64| {
+            let covariance = Covariance::from_sigmas([sigma; 6]).unwrap();
             let t_i_j = Relative::Metric(PoseWithCovariance { pose: along(off - 10.0), covariance });
             EdgeView {
                 kind: "alignment".into(),
@@ -398,8 +427,33 @@ mod tests {
             }
         };
         let judge = Judge { tracks: &tracks, planar: true, truth: TRUTH };
-        judge.alignments(&[edge("b/0#0", 0.0), edge("b/0#0", 1.1), edge("b/0#7", 9.0)], &mut judged);
-        assert_eq!((judged.alignments, judged.falsely, judged.used_unjudged), ([3, 3, 3], [1, 1], 1));
-        assert!(matches!(judged.false_ones.as_slice(), [one] if one.contains("1.10 m")), "{:?}", judged.false_ones);
+        let edges =
+            [edge("b/0#0", 0.0, 0.1), edge("b/0#0", 1.1, 0.1), edge("b/0#0", 1.2, 1.0), edge("b/0#7", 9.0, 0.1)];
+        judge.alignments(&edges, &mut judged);
+        assert_eq!((judged.alignments, judged.falsely, judged.used_unjudged), ([4, 4, 4], [2, 2], 1));
+        assert_eq!(judged.beyond_claim, 1, "one of the false says of itself that it is vague");
+        let [one, vague] = judged.false_ones.as_slice() else { panic!("{:?}", judged.false_ones) };
+        assert!(one.contains("1.10 m") && vague.contains("1.20 m"), "{one}; {vague}");
+    }
+
+    /// The truth of an anchor is as doubtful as it is said to be, and no more: 10 m away, 0.02 rad are 0.2 m.
+    #[test]
+    fn what_is_not_known_of_an_anchor_is_not_held_against_a_map() {
+        let mut tracks = tracks();
+        let judge = |tracks: &[Track]| {
+            let judge = Judge { tracks, planar: true, truth: TRUTH };
+            let mut judged = Judged { pairs: judge.overlaps(), ..Judged::default() };
+            judge.statements(&[said(20, 0, Some(0.6))], Instant::ZERO.after(Duration::from_secs(60)), &mut judged);
+            judged.pairs[&(0, 1)].wrong
+        };
+        assert_eq!(judge(&tracks), 1);
+        tracks[1].anchors.get_mut(&0).unwrap().doubt = 0.05;
+        assert_eq!(judge(&tracks), 1, "five standard deviations are left");
+        tracks[1].anchors.get_mut(&0).unwrap().doubt = 0.2;
+        assert_eq!(judge(&tracks), 0);
+        tracks[1].anchors.get_mut(&0).unwrap().doubt = 0.02;
+        assert_eq!(judge(&tracks), 1);
+        tracks[0].anchors.get_mut(&0).unwrap().doubt = 0.02;
+        assert_eq!(judge(&tracks), 0);
     }
 }

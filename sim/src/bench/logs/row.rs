@@ -8,7 +8,7 @@ use super::{Played, Prepared};
 use std::io::Write;
 
 /// Names of the columns.
-pub const COLUMNS: [&str; 27] = [
+pub const COLUMNS: [&str; 28] = [
     "set",
     "wires",
     "robots",
@@ -32,6 +32,7 @@ pub const COLUMNS: [&str; 27] = [
     "between_deg",
     "nees_pairs",
     "nees_anchors",
+    "beyond_claim",
     "used_unjudged",
     "bytes",
     "cpu_s",
@@ -88,7 +89,7 @@ impl Row {
     /// Nothing was ever wrong, no false alignment is used, and all merged that should.
     pub fn is_good(&self) -> bool {
         let [overlapping, merged] = self.overlapping();
-        self.wrong() == 0 && self.judged.falsely[1] == 0 && merged == overlapping
+        self.wrong() == 0 && self.judged.beyond_claim == 0 && merged == overlapping
     }
 
     fn verdict(&self) -> &'static str {
@@ -96,7 +97,7 @@ impl Row {
         match (self.is_good(), merged == overlapping) {
             (true, _) => "good",
             (false, true) => "WRONG",
-            (false, false) if self.wrong() > 0 || self.judged.falsely[1] > 0 => "WRONG, in pieces",
+            (false, false) if self.wrong() > 0 || self.judged.beyond_claim > 0 => "WRONG, in pieces",
             (false, false) => "in pieces",
         }
     }
@@ -129,7 +130,7 @@ impl Row {
             fields.extend([format!("{metres:.3}"), format!("{degrees:.2}")]);
         }
         fields.extend([nees_pairs, nees_anchors].map(|all| format!("{:.2}", mean(all))));
-        fields.extend([self.judged.used_unjudged.to_string(), bytes.to_string()]);
+        fields.extend([self.judged.beyond_claim.to_string(), self.judged.used_unjudged.to_string(), bytes.to_string()]);
         fields.extend([format!("{:.1}", self.cpu_s), self.verdict().into()]);
         fields
     }
@@ -142,6 +143,7 @@ impl Row {
             .map(|[metres, degrees]| [number(metres, 3), number(degrees, 2)]);
         let [overlapping, merged] = self.overlapping();
         let ([stated, agreed, used], [false_agreed, false_used]) = (judged.alignments, judged.falsely);
+        let beyond = judged.beyond_claim;
         writeln!(out, "{set} ({wires}): {}", self.verdict())?;
         writeln!(
             out,
@@ -151,8 +153,8 @@ impl Row {
         )?;
         writeln!(
             out,
-            "  alignments: {stated} stated, {agreed} agreed ({false_agreed} false), {used} used ({false_used} false, {} not \
-             judged)",
+            "  alignments: {stated} stated, {agreed} agreed ({false_agreed} false), {used} used ({false_used} false, \
+             {beyond} of them beyond what they claim; {} not judged)",
             judged.used_unjudged
         )?;
         writeln!(
@@ -229,8 +231,8 @@ mod tests {
     use super::*;
     use std::collections::BTreeMap;
 
-    fn row(pair: PairFate, falsely: [usize; 2]) -> Row {
-        let judged = Judged { pairs: BTreeMap::from([((0, 1), pair)]), falsely, ..Judged::default() };
+    fn row(pair: PairFate, falsely: [usize; 2], beyond_claim: usize) -> Row {
+        let judged = Judged { pairs: BTreeMap::from([((0, 1), pair)]), falsely, beyond_claim, ..Judged::default() };
         let robots = vec!["a".into(), "b".into()];
         Row { set: "log".into(), wires: "perfect".into(), robots, keyframes: 7, judged, cpu_s: 1.0 }
     }
@@ -239,7 +241,7 @@ mod tests {
     fn what_was_not_found_is_no_number() {
         assert_eq!((number(0.126, 2), number(f64::NAN, 2)), ("0.13".into(), "–".into()));
         let mut printed = Vec::new();
-        row(PairFate::default(), [0, 0]).print(&mut printed).unwrap();
+        row(PairFate::default(), [0, 0], 0).print(&mut printed).unwrap();
         let printed = String::from_utf8(printed).unwrap();
         assert!(printed.contains("– m – deg of 0") && !printed.contains("NaN"), "{printed}");
     }
@@ -250,15 +252,17 @@ mod tests {
         let merged = PairFate { merged: true, ..overlapping.clone() };
         let wrong = PairFate { wrong: 1, ..merged.clone() };
         let cases = [
-            (merged.clone(), [0, 0], "good"),
-            (PairFate { overlap_secs: None, ..overlapping.clone() }, [0, 0], "good"),
-            (overlapping.clone(), [0, 0], "in pieces"),
-            (wrong, [0, 0], "WRONG"),
-            (merged, [1, 1], "WRONG"),
-            (overlapping, [1, 1], "WRONG, in pieces"),
+            (merged.clone(), [0, 0], 0, "good"),
+            (PairFate { overlap_secs: None, ..overlapping.clone() }, [0, 0], 0, "good"),
+            (overlapping.clone(), [0, 0], 0, "in pieces"),
+            (wrong, [0, 0], 0, "WRONG"),
+            // Vague, and it says so.
+            (merged.clone(), [1, 1], 0, "good"),
+            (merged, [1, 1], 1, "WRONG"),
+            (overlapping, [1, 1], 1, "WRONG, in pieces"),
         ];
-        for (pair, falsely, verdict) in cases {
-            let row = row(pair, falsely);
+        for (pair, falsely, beyond_claim, verdict) in cases {
+            let row = row(pair, falsely, beyond_claim);
             assert_eq!((row.verdict(), row.is_good()), (verdict, verdict == "good"));
             let (fields, mut text) = (row.fields(), Vec::new());
             assert_eq!(fields.len(), COLUMNS.len());
