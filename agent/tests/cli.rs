@@ -60,8 +60,18 @@ fn a_generated_key_makes_a_good_configuration() {
     let default = include_str!("../dist/default.toml");
     let filled = default.replace("# alpha = \"…\"", line.trim());
     std::fs::write(dir.path().join("a.toml"), &filled).unwrap();
+    let without = merganser(&["check", "-c", "a.toml"], dir.path());
+    assert_eq!(without.status.code(), Some(2));
+    assert!(text(&without.stderr).contains("demo.authority.crt: No such file"), "{}", text(&without.stderr));
+    let good = |arguments: &[&str]| {
+        let done = merganser(arguments, dir.path());
+        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+    };
+    good(&["keys", "authority", "--swarm", "demo"]);
+    good(&["keys", "certificate", "--authority", "demo.authority.key", "-c", "a.toml"]);
     let checked = merganser(&["check", "-c", "a.toml"], dir.path());
     assert_eq!(checked.status.code(), Some(0), "{}", text(&checked.stderr));
+    assert!(text(&checked.stdout).contains("Links by TLS; certificate until 20"), "{}", text(&checked.stdout));
     assert!(text(&checked.stdout).starts_with("# a.toml: good. Robot alpha of swarm demo"));
 
     std::fs::write(dir.path().join("a.toml"), filled.replace("queue = 1024", "queues = 1024")).unwrap();
@@ -80,6 +90,7 @@ fn the_commented_defaults_are_the_defaults() {
     let full = include_str!("../dist/default.toml").replace("# alpha = \"…\"", &key);
     let head: String = full.lines().take_while(|line| !line.starts_with("[store]")).map(|l| format!("{l}\n")).collect();
     let parse = |text: &str| FileConfig::parse(text, Path::new("default.toml")).unwrap();
+    let head = head + "[zenoh]\ncertificate = \"alpha.crt\"\nauthority = \"demo.authority.crt\"\n";
     assert_eq!(parse(&full), parse(&head));
     let written = toml::to_string(&parse(&full)).unwrap();
     for line in written.lines().filter(|line| line.contains(" = ") && !line.starts_with("alpha")) {

@@ -4,7 +4,7 @@
 use super::air::Air;
 use super::common::swarm;
 use super::spectator::{PORT, ROBOT};
-use merganser::config::FileConfig;
+use merganser::config::{FileConfig, Security};
 use merganser_protocol::snapshot::{FramesView, StatsView, StatusView};
 use serde::Deserialize;
 use std::collections::BTreeSet;
@@ -166,6 +166,7 @@ impl Seen {
 impl<'a> Robot<'a> {
     fn new(air: &'a Air, home: &Path, config: FileConfig, connect: Vec<String>) -> Self {
         let mut config = FileConfig { core: Default::default(), ..config };
+        config.zenoh.security = Some(Security::None);
         config.zenoh.listen = vec![format!("tcp/[::]:{PORT}")];
         config.zenoh.connect = connect;
         config.zenoh.multicast = true;
