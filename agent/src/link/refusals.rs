@@ -14,6 +14,8 @@ use tracing_subscriber::registry::LookupSpan;
 /// Where Zenoh tells of links that it is asked for, and of those that it asks for.
 const ACCEPTS: &str = "zenoh_link_tls";
 const CONNECTS: &str = "zenoh::net::runtime::orchestrator";
+/// What Zenoh warns of at each link, since we told it not to compare names to addresses.
+const NO_NEWS: &str = "Skipping name verification";
 /// Reasons kept apart until they are taken.
 const REASONS_MAX: usize = 32;
 /// Longest reason kept, in characters.
@@ -37,11 +39,18 @@ impl Refusal {
     fn parse(target: &str, line: &str) -> Option<Self> {
         let short = |text: &str| text.chars().take(REASON_CHARS_MAX).collect::<String>();
         let begins = ["invalid peer certificate", "received fatal alert", "peer sent no certificates"];
-        let at = begins.iter().filter_map(|begin| line.find(begin)).min()?;
-        // What follows is Zenoh's: where in its source, when it tries again, a hint about open files.
+        let at = match begins.iter().filter_map(|begin| line.find(begin)).min() {
+            Some(at) => at,
+            None if target.starts_with(ACCEPTS) && !line.starts_with(NO_NEWS) => 0,
+            None => return None,
+        };
+        // What follows is another at each try, or Zenoh's: where in its source, when it tries again, a hint about files.
         let rest = &line[at..];
-        let end = ["., at ", " at /", ". Hint", ". Retry", ".)", "\n"].iter().filter_map(|end| rest.find(end)).min();
-        let reason = short(rest[..end.unwrap_or(rest.len())].trim_end_matches(['.', ' ', ')']));
+        let end = [": verification time", "., at ", " at /", ". Hint", ". Retry", ".)", "\n"]
+            .iter()
+            .filter_map(|end| rest.find(end))
+            .min();
+        let reason = short(rest[..end.unwrap_or(rest.len())].trim_end_matches(['.', ' ']));
         let called = (target == CONNECTS).then(|| {
             let begin = line.find("tls/").map_or("", |begin| &line[begin..]);
             short(begin.split(|c: char| c.is_whitespace() || "!,;?#".contains(c)).next().unwrap_or_default())
@@ -52,14 +61,18 @@ impl Refusal {
     /// What it means, and what helps.
     pub fn cure(&self) -> &'static str {
         let has = |part: &str| self.reason.contains(part);
-        if has("NotValidYet") {
+        if has("not valid yet") {
             "one of the two hosts has a wrong clock"
-        } else if has("Expired") {
+        } else if has("expired") || has("Expired") {
             "the certificate is over (or a clock is wrong): renew it by `merganser keys certificate`"
         } else if has("UnknownIssuer") || has("UnknownCA") || has("BadSignature") || has("DecryptError") {
             "the certificate is of another swarm or another authority: make it with this swarm's"
         } else if has("no certificates") || has("CertificateRequired") {
             "somebody without a certificate called; robots get theirs by `merganser keys certificate`"
+        } else if has("corrupt message") || has("eof") {
+            "somebody called who does not speak TLS, or hung up; without zenoh.security = \"none\" there is no plain TCP"
+        } else if has("open files") {
+            "let the agent have more files open: LimitNOFILE in its unit"
         } else {
             "look at both certificates; `merganser check` tells of one's own"
         }
@@ -102,7 +115,7 @@ pub fn layer<S>(into: Arc<Refusals>) -> Filtered<Noting, FilterFn, S>
 where
     S: Subscriber + for<'a> LookupSpan<'a>,
 {
-    let wanted = |event: &Metadata<'_>| event.target().starts_with(ACCEPTS) || event.target() == CONNECTS;
+    let wanted = |event: &Metadata<'_>| is_told_otherwise(event) || event.target() == CONNECTS;
     Noting(into).with_filter(filter_fn(wanted))
 }
 
@@ -127,5 +140,63 @@ impl Visit for Message {
         if field.name() == "message" {
             let _ = write!(self.0, "{value:?}"); // a String takes any text
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn zenohs_lines_are_read_whoever_called() {
+        let accepts = "zenoh_link_tls::unicast";
+        for (target, line, wanted) in [
+            (
+                accepts,
+                "invalid peer certificate: UnknownIssuer. Hint: increase the system open file limit.",
+                Some("refused: a link from somebody: invalid peer certificate: UnknownIssuer"),
+            ),
+            (
+                accepts,
+                "invalid peer certificate: certificate expired: verification time 1 (UNIX), but certificate is not valid \
+                 after 0 (1 seconds ago). Hint: increase",
+                Some("refused: a link from somebody: invalid peer certificate: certificate expired"),
+            ),
+            (
+                CONNECTS,
+                "Unable to connect to configured peer tls/10.0.0.2:7447! Can not create a new TLS link bound to \
+                 IpAddress(V4(Ipv4Addr([10, 0, 0, 2]))): invalid peer certificate: BadSignature at \
+                 /x/unicast.rs:1.. Retry in 1s.",
+                Some("refused: a link to tls/10.0.0.2:7447: invalid peer certificate: BadSignature"),
+            ),
+            (CONNECTS, "Unable to connect to configured peer tls/10.0.0.2:7447! No route to host. Retry in 1s.", None),
+            (
+                accepts,
+                "Too many open files (os error 24). Hint: increase the system open file limit.",
+                Some("refused: a link from somebody: Too many open files (os error 24)"),
+            ),
+            (
+                accepts,
+                "received corrupt message of type InvalidContentType. Hint: increase",
+                Some("refused: a link from somebody: received corrupt message of type InvalidContentType"),
+            ),
+            (accepts, "Skipping name verification of TLS server", None),
+        ] {
+            assert_eq!(Refusal::parse(target, line).map(|refusal| refusal.to_string()).as_deref(), wanted, "{line}");
+        }
+    }
+
+    #[test]
+    fn reasons_are_bounded() {
+        let refusals = Refusals::default();
+        let of = |k: usize| Refusal { called: Some(format!("tls/10.0.0.2:{k}")), reason: "x".into() };
+        (0..REASONS_MAX + 5).for_each(|k| refusals.note(of(k)));
+        let kept = refusals.take();
+        assert_eq!((kept.len(), kept[&of(0)]), (REASONS_MAX + 1, 1));
+        assert_eq!(kept[&Refusal { called: None, reason: "other reasons".into() }], 5);
+        assert!(refusals.take().is_empty());
+        let long = format!("invalid peer certificate: {}", "x".repeat(1_000));
+        let kept = Refusal::parse(ACCEPTS, &long).unwrap().reason;
+        assert_eq!(kept.chars().count(), REASON_CHARS_MAX);
     }
 }
