@@ -34,7 +34,7 @@ fn the_least_configuration_is_enough() {
     wanted.zenoh.listen = vec!["tcp/[::]:0".into()];
     assert_eq!(config, wanted);
     let config = FileConfig::parse(&text("alpha", KEY, CERTIFIED), Path::new("a.toml")).unwrap();
-    assert!(config.zenoh.is_guarded() && config.zenoh.listen == ["tls/[::]:0"]);
+    assert!(config.zenoh.is_guarded() && config.zenoh.listen == ["tls/0.0.0.0:0"]);
 }
 
 /// TLS, or nothing said plainly, for whoever has links beyond its host.
@@ -46,6 +46,7 @@ fn links_beyond_this_host_are_protected_or_said_not_to_be() {
     assert!(!good("[zenoh]\nmulticast = false\nmode = \"client\"\nconnect = [\"tcp/127.0.0.1:7\"]").zenoh.is_guarded());
     let tls = format!("{alone}\nsecurity = \"tls\"\ncertificate = \"a\"\nauthority = \"b\"").replace("tcp/", "tls/");
     assert!(good(&tls).zenoh.is_guarded() && !good(&tls).zenoh.stays_on_this_host());
+    assert!(good(&tls.replace("security = \"tls\"\n", "")).zenoh.is_guarded(), "endpoints of TLS say so");
     let cases: &[(&str, &[&str])] = &[
         ("", &["a.toml", "zenoh.security", "zenoh.certificate", "zenoh.authority", "keys authority", "\"none\""]),
         ("[zenoh]\nlisten = [\"tcp/[::]:7\"]\nmulticast = false", &["zenoh.security", "beyond this host"]),
@@ -59,6 +60,8 @@ fn links_beyond_this_host_are_protected_or_said_not_to_be() {
         ),
         (&format!("{PLAIN}\nconnect = [\"tls/10.0.0.2:7\"]"), &["a.toml:8", "zenoh.connect", "is TLS"]),
         (&format!("{PLAIN}\nlisten = [\"tls/[::]:7\"]"), &["a.toml:8", "zenoh.listen", "is TLS"]),
+        (&format!("{CERTIFIED}\nlisten = [\"tls/[::]:7\"]"), &["a.toml:9", "zenoh.listen", "IPv6", "0.0.0.0"]),
+        (&format!("{CERTIFIED}\nconnect = [\"tls/[fd00::1]:7\"]"), &["a.toml:9", "zenoh.connect", "IPv6"]),
         (&format!("{PLAIN}\nconnect = [\"udp/10.0.0.2:7\"]"), &["a.toml:8", "neither TLS nor TCP"]),
         (&format!("{CERTIFIED}\nconnect = [\"tls/10.0.0.2:7#enable_mtls=false\"]"), &["a.toml:9", "after '#'"]),
         (&format!("{CERTIFIED}\ninput_listen = [\"tls/127.0.0.1:7\"]"), &["a.toml:9", "is not TCP"]),

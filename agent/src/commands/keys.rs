@@ -75,7 +75,7 @@ pub enum KeysCommand {
         #[arg(long, value_parser = name)]
         name: Name,
         /// Where it listens. May be given more than once.
-        #[arg(long, value_name = "ENDPOINT", default_value = "tls/[::]:7447", value_parser = endpoint)]
+        #[arg(long, value_name = "ENDPOINT", default_value = "tls/0.0.0.0:7447", value_parser = endpoint)]
         listen: Vec<String>,
         /// Another router to connect to. May be given more than once.
         #[arg(long, value_name = "ENDPOINT", value_parser = endpoint)]
@@ -99,8 +99,8 @@ fn days() -> clap::builder::RangedI64ValueParser<u32> {
 
 fn endpoint(text: &str) -> Result<String, String> {
     match text.parse::<zenoh::config::EndPoint>() {
-        Ok(_) if text.starts_with("tls/") && !text.contains('#') => Ok(text.into()),
-        _ => Err("write e.g. tls/10.0.0.2:7447".into()),
+        Ok(_) if text.starts_with("tls/") && !text.contains(['#', '[']) => Ok(text.into()),
+        _ => Err("write e.g. tls/10.0.0.2:7447, with an IPv4 address or a name".into()),
     }
 }
 

@@ -21,6 +21,7 @@ const LOOPBACKS: [&str; 2] = ["lo", "lo0"];
 /// How endpoints of the two transports begin.
 const TLS: &str = "tls/";
 const PLAIN: &str = "tcp/";
+const TLS_IPV6: &str = "tls/[";
 
 /// How an agent takes part in the Zenoh network.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -63,7 +64,8 @@ pub struct ZenohConfig {
     /// Peer unless the swarm is large.
     pub mode: Mode,
     /// How links with other robots are protected. Absent: by TLS, unless they never leave this host
-    /// (no multicast, and all endpoints on the loopback).
+    /// (no multicast, and all endpoints on the loopback) and none of
+    /// them is TLS.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub security: Option<Security>,
     /// This robot's certificate, with the key of `key_file`; relative to the configuration file's folder.
@@ -119,7 +121,7 @@ impl Default for ZenohConfig {
             certificate: None,
             authority: None,
             routers: Vec::new(),
-            listen: vec!["tls/[::]:0".into()],
+            listen: vec!["tls/0.0.0.0:0".into()],
             connect: Vec::new(),
             multicast: true,
             gossip: true,
@@ -213,19 +215,24 @@ impl ZenohConfig {
         match self.security {
             Some(Security::Tls) => true,
             Some(Security::None) => false,
-            None => !self.links_stay_on_this_host(),
+            None => !self.links_stay_on_this_host() || self.links().any(|endpoint| endpoint.starts_with(TLS)),
         }
     }
 
     /// Whether no link can lead beyond this host's loopback.
     fn links_stay_on_this_host(&self) -> bool {
+        !self.multicast && self.links().all(|endpoint| is_loopback(endpoint))
+    }
+
+    /// Endpoints of links with other robots.
+    fn links(&self) -> impl Iterator<Item = &String> {
         let listen: &[String] = if self.mode == Mode::Client { &[] } else { &self.listen };
-        !self.multicast && listen.iter().chain(&self.connect).all(|endpoint| is_loopback(endpoint))
+        listen.iter().chain(&self.connect)
     }
 
     /// Where to listen if nothing is said: any free port of all addresses.
     pub fn default_listen(&self) -> Vec<String> {
-        vec![format!("{}[::]:0", if self.is_guarded() { TLS } else { PLAIN })]
+        vec![if self.is_guarded() { format!("{TLS}0.0.0.0:0") } else { format!("{PLAIN}[::]:0") }]
     }
 
     /// Checks that links are protected, or said not to be.
@@ -261,19 +268,28 @@ impl ZenohConfig {
             (Some(_), None, _) => return refuse("zenoh.certificate", format!("is missing ({make}), {none}")),
             (Some(_), _, None) => return refuse("zenoh.authority", format!("is missing ({make}), {none}")),
         }
-        match endpoints().find(|(_, endpoint)| endpoint.starts_with(PLAIN)) {
-            Some((key, endpoint)) => refuse(key, format!("{endpoint:?} is plain TCP: write \"tls/…\", {none}")),
-            None => Ok(()),
+        for (key, endpoint) in endpoints() {
+            if endpoint.starts_with(PLAIN) {
+                return refuse(key, format!("{endpoint:?} is plain TCP: write \"tls/…\", {none}"));
+            }
+            if endpoint.starts_with(TLS_IPV6) {
+                // It takes the brackets for a part of the name. Robots that scout would be told of this address alone.
+                return refuse(
+                    key,
+                    format!(
+                        "{endpoint:?} is an IPv6 address, to which Zenoh opens no link by TLS; write an IPv4 address, \
+                         a host's name, or \"tls/0.0.0.0:…\" to listen"
+                    ),
+                );
+            }
         }
+        Ok(())
     }
 
     /// Whether the session of the robots has its endpoints on this host's loopback alone, and does not look for others:
     /// a swarm on one computer, as in simulations and tests.
     pub fn stays_on_this_host(&self) -> bool {
-        self.security != Some(Security::Tls)
-            && self.mode != Mode::Client
-            && !self.listen.is_empty()
-            && self.links_stay_on_this_host()
+        !self.is_guarded() && self.mode != Mode::Client && !self.listen.is_empty() && self.links_stay_on_this_host()
     }
 
     /// Interfaces over which the session of the robots takes input.

@@ -157,6 +157,15 @@ fn a_robot_that_only_scouts_ends_where_its_address_is_new_and_is_found_when_star
 
 #[test]
 #[ignore = "night: root only, in network namespaces of its own"]
+fn robots_that_only_scout_find_one_another_by_tls() {
+    let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
+    let mut fleet = Fleet::scout_guarded(&air, 8.0);
+    fleet.until_all("everybody hears everybody", |seen| seen.neighbours().len() == 2);
+    fleet.end_alike();
+}
+
+#[test]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_loss_of_5_percent_changes_nothing() {
     lossy(5);
 }

@@ -55,6 +55,11 @@ impl<'a> Fleet<'a> {
         Self::start(air, speed, false, false)
     }
 
+    /// The same by TLS.
+    pub fn scout_guarded(air: &'a Air, speed: f64) -> Self {
+        Self::start(air, speed, false, true)
+    }
+
     fn start(air: &'a Air, speed: f64, names_peers: bool, guarded: bool) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let names = name_list();
@@ -176,8 +181,8 @@ impl<'a> Robot<'a> {
     fn new(air: &'a Air, home: &Path, config: FileConfig, connect: Vec<String>) -> Self {
         let mut config = FileConfig { core: Default::default(), ..config };
         let security = *config.zenoh.security.get_or_insert(Security::None);
-        let transport = if security == Security::Tls { "tls" } else { "tcp" };
-        config.zenoh.listen = vec![format!("{transport}/[::]:{PORT}")];
+        let everywhere = if security == Security::Tls { "tls/0.0.0.0" } else { "tcp/[::]" };
+        config.zenoh.listen = vec![format!("{everywhere}:{PORT}")];
         config.zenoh.input_listen = None;
         config.zenoh.connect = connect;
         config.zenoh.multicast = true;
