@@ -85,6 +85,11 @@ pub enum Problem {
     /// It cannot be read or written.
     #[error("{0}")]
     Io(#[from] io::Error),
+    /// It is not there.
+    #[error(
+        "No such file; `merganser keys authority` makes the one of a swarm, `merganser keys certificate` the others"
+    )]
+    Missing,
     /// It is too large.
     #[error("the file is larger than {FILE_LEN_MAX} bytes; is it a certificate that `merganser keys` made?")]
     Large,
@@ -188,7 +193,10 @@ impl Certificate {
     /// # Errors
     /// [`CertificateError`] with the file's name.
     pub fn load(path: &Path) -> Result<Self, CertificateError> {
-        let text = read_bounded(path).map_err(|problem| problem.at(path))?;
+        let text = read_bounded(path).map_err(|problem| match problem {
+            Problem::Io(error) if error.kind() == io::ErrorKind::NotFound => Problem::Missing.at(path),
+            problem => problem.at(path),
+        })?;
         Self::parse(&text).map_err(|problem| problem.at(path))
     }
 
