@@ -47,12 +47,15 @@ pub enum Holder {
 impl Holder {
     /// What a common name says, if it is one of ours.
     pub fn parse(text: &str) -> Option<Self> {
-        let kinds: [(&str, fn(Name) -> Self); 3] =
-            [(OBSERVER, Self::Observer), (ROUTER, Self::Router), (SWARM, Self::Swarm)];
-        for (prefix, kind) in kinds {
-            if let Some(name) = text.strip_prefix(prefix) {
-                return Name::new(name).ok().map(kind);
-            }
+        let of = |prefix: &str| text.strip_prefix(prefix).map(|name| Name::new(name).ok());
+        if let Some(name) = of(OBSERVER) {
+            return name.map(Self::Observer);
+        }
+        if let Some(name) = of(ROUTER) {
+            return name.map(Self::Router);
+        }
+        if let Some(name) = of(SWARM) {
+            return name.map(Self::Swarm);
         }
         Name::new(text).ok().map(Self::Robot)
     }

@@ -85,6 +85,23 @@ fn an_authority_whose_files_do_not_belong_together_is_told() {
     assert!(told.contains("mine.authority.key") && told.contains("no ed25519 key in PEM"), "{told}");
 }
 
+#[test]
+fn files_are_bounded_on_both_sides() {
+    let dir = tempfile::tempdir().unwrap();
+    let authority = Authority::generate(name("demo"), 10).unwrap();
+    let path = dir.path().join("a.crt");
+    let filled = |bytes: u64| {
+        let pem = authority.certificate().pem().as_bytes();
+        let mut content = pem.to_vec();
+        content.resize(bytes as usize, b'\n');
+        std::fs::write(&path, content).unwrap();
+        Certificate::load(&path)
+    };
+    assert!(filled(FILE_LEN_MAX).is_ok());
+    let told = filled(FILE_LEN_MAX + 1).unwrap_err().to_string();
+    assert!(told.contains("a.crt") && told.contains("larger than 16384 bytes"), "{told}");
+}
+
 /// What of a robot's own files does not fit is one error each, with file and cure.
 #[test]
 fn credentials_that_do_not_fit_are_told_by_file() {

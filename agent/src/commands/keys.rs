@@ -3,7 +3,7 @@
 
 use super::{BadInput, say};
 use crate::certificates::authority::{AUTHORITY_DAYS, Authority, DAYS, DAYS_MAX, Files, write_new, write_over};
-use crate::certificates::{CertificateError, Holder, Problem, router};
+use crate::certificates::{Holder, Problem, router};
 use crate::config::FileConfig;
 use crate::trust::{PublicKey, SecretKey};
 use anyhow::{Context, Result};
@@ -176,7 +176,7 @@ fn both(authority: &Path, config: &Path) -> Result<(Authority, FileConfig)> {
     let config = FileConfig::load(config)?;
     if *authority.swarm() != config.swarm {
         let [is, wanted] = [authority.swarm().clone(), config.swarm.clone()].map(Holder::Swarm);
-        return Err(CertificateError::from(Problem::Holder { is, wanted }.at(&files.certificate)).into());
+        return Err(Problem::Holder { is, wanted }.at(&files.certificate).into());
     }
     Ok((authority, config))
 }
