@@ -1,6 +1,7 @@
 //! The command line. Exit codes: 0, all went well; 1, it did not (a check failed, the agent could not go on); 2, the
 //! command line, the configuration or a file that was given is wrong.
 
+use crate::certificates::{self, CertificateError};
 use crate::commands::{BadInput, align, check, doctor, graph, keys, replay, run, store, watch};
 use crate::config::FileConfigError;
 use crate::demo::{self, DemoArgs};
@@ -43,7 +44,7 @@ pub enum Command {
     Watch(watch::WatchArgs),
     /// Check a configuration and print what it means.
     Check(check::CheckArgs),
-    /// Make and show keys.
+    /// Make and show keys and certificates.
     #[command(subcommand)]
     Keys(keys::KeysCommand),
     /// Look into a robot's store of facts: is it sound, what does it hold.
@@ -107,15 +108,26 @@ fn is_bad_input(error: &anyhow::Error) -> bool {
         cause.is::<BadInput>() || cause.downcast_ref::<RecordingError>().is_some_and(is_bad_recording)
     };
     error.downcast_ref::<FileConfigError>().is_some()
+        || error.downcast_ref::<CertificateError>().is_some_and(is_bad_certificate)
         || matches!(host, Some(HostError::Config(_)))
         || error.chain().any(is_bad)
 }
 
+fn is_bad_certificate(error: &CertificateError) -> bool {
+    match &error.problem {
+        certificates::Problem::Io(error) => is_not_there(error),
+        certificates::Problem::Make(_) | certificates::Problem::Exists => false,
+        _ => true,
+    }
+}
+
+fn is_not_there(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory | ErrorKind::IsADirectory)
+}
+
 fn is_bad_recording(error: &RecordingError) -> bool {
     match &error.problem {
-        Problem::Io(error) => {
-            matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory | ErrorKind::IsADirectory)
-        }
+        Problem::Io(error) => is_not_there(error),
         _ => true,
     }
 }

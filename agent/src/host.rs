@@ -6,7 +6,7 @@ use crate::driver::{Clock, Driver, Finished, Parts, Snapshots};
 use crate::journal::{self, Start};
 use crate::link::Link;
 use crate::link::scouting::Scouting;
-use crate::link::session::LinkError;
+use crate::link::session::{Guard, LinkError};
 use crate::queue::{Inbox, queue};
 use crate::store;
 use merganser_protocol::agent::{Agent, Core, StartError};
@@ -115,13 +115,14 @@ impl Host {
         journal: Option<journal::Writer>,
         clock: Clock,
     ) -> Result<Self, HostError> {
+        let guard = Guard::of(config)?;
         let (inbox, outbox) = queue(config.driver.queue);
         let deliver = inbox.clone();
         let wait = Duration::from_millis(config.store.commit_ms);
         let store = store::Writer::spawn(store, wait, move |done| deliver.deliver(done));
         let store = store.map_err(|e| refused("thread", e))?;
         let scouting = Scouting::begin(&config.zenoh);
-        let (opened, network) = Link::open(config, inbox.clone()).await?;
+        let (opened, network) = Link::open(config, guard.as_ref(), inbox.clone()).await?;
         let (jobs, own) = (config.driver.jobs, inbox.clone());
         let (driver, snapshots) = Driver::new(Parts { core, network, store, journal, outbox, inbox: own, clock, jobs });
         let (stop, stopped) = oneshot::channel();

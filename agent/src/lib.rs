@@ -21,6 +21,7 @@
 //! # Ok(()) }
 //! ```
 
+pub mod certificates;
 pub mod cli;
 pub mod commands;
 pub mod config;

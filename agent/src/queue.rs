@@ -266,7 +266,12 @@ impl Drops {
 
     /// Counts one under a text that names a robot, or, if too many are named already, under `others`.
     pub fn count_named(&self, reason: String, others: &str) {
-        count(&self.named, reason, NAMES_MAX, others);
+        self.count_named_first(reason, others);
+    }
+
+    /// The same; whether it is the first that is counted there.
+    pub fn count_named_first(&self, reason: String, others: &str) -> bool {
+        count(&self.named, reason, NAMES_MAX, others)
     }
 
     /// All counters.

@@ -1,6 +1,7 @@
 //! The program from outside: its help and its exit codes.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -60,9 +61,42 @@ fn a_generated_key_makes_a_good_configuration() {
     let default = include_str!("../dist/default.toml");
     let filled = default.replace("# alpha = \"…\"", line.trim());
     std::fs::write(dir.path().join("a.toml"), &filled).unwrap();
+    let without = merganser(&["check", "-c", "a.toml"], dir.path());
+    assert_eq!(without.status.code(), Some(2));
+    assert!(text(&without.stderr).contains("demo.authority.crt: No such file"), "{}", text(&without.stderr));
+    let good = |arguments: &[&str]| {
+        let done = merganser(arguments, dir.path());
+        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+    };
+    for days in ["0", "36501"] {
+        assert_eq!(
+            merganser(&["keys", "authority", "--swarm", "demo", "--days", days], dir.path()).status.code(),
+            Some(2)
+        );
+    }
+    good(&["keys", "authority", "--swarm", "demo", "--days", "36500"]);
+    let again = merganser(&["keys", "authority", "--swarm", "demo"], dir.path());
+    assert_eq!(again.status.code(), Some(1), "an authority is never overwritten");
+    let mode = std::fs::metadata(dir.path().join("demo.authority.key")).unwrap().permissions().mode();
+    assert_eq!(mode & 0o777, 0o600);
+    good(&["keys", "certificate", "--authority", "demo.authority.key", "-c", "a.toml"]);
     let checked = merganser(&["check", "-c", "a.toml"], dir.path());
     assert_eq!(checked.status.code(), Some(0), "{}", text(&checked.stderr));
+    assert!(text(&checked.stdout).contains("Links by TLS; certificate until 20"), "{}", text(&checked.stdout));
     assert!(text(&checked.stdout).starts_with("# a.toml: good. Robot alpha of swarm demo"));
+    let router = ["keys", "router", "--authority", "demo.authority.key", "-c", "a.toml", "--name", "hub"];
+    let unnamed = merganser(&router, dir.path());
+    assert_eq!(unnamed.status.code(), Some(2));
+    assert!(text(&unnamed.stderr).contains("zenoh.routers: hub is not in it"), "{}", text(&unnamed.stderr));
+    std::fs::write(dir.path().join("a.toml"), filled.replace("# routers", "routers")).unwrap();
+    good(&router);
+    let mode = std::fs::metadata(dir.path().join("hub.json5")).unwrap().permissions().mode();
+    assert_eq!(mode & 0o777, 0o600, "it holds a key");
+    good(&["keys", "authority", "--swarm", "other"]);
+    let mixed = ["keys", "certificate", "--authority", "other.authority.key", "-c", "a.toml"];
+    let mixed = merganser(&mixed, dir.path());
+    assert_eq!(mixed.status.code(), Some(2));
+    assert!(text(&mixed.stderr).contains("swarm:other; here belongs the one of swarm:demo"), "{}", text(&mixed.stderr));
 
     std::fs::write(dir.path().join("a.toml"), filled.replace("queue = 1024", "queues = 1024")).unwrap();
     let refused = merganser(&["check", "-c", "a.toml"], dir.path());
@@ -80,6 +114,7 @@ fn the_commented_defaults_are_the_defaults() {
     let full = include_str!("../dist/default.toml").replace("# alpha = \"…\"", &key);
     let head: String = full.lines().take_while(|line| !line.starts_with("[store]")).map(|l| format!("{l}\n")).collect();
     let parse = |text: &str| FileConfig::parse(text, Path::new("default.toml")).unwrap();
+    let head = head + "[zenoh]\ncertificate = \"alpha.crt\"\nauthority = \"demo.authority.crt\"\n";
     assert_eq!(parse(&full), parse(&head));
     let written = toml::to_string(&parse(&full)).unwrap();
     for line in written.lines().filter(|line| line.contains(" = ") && !line.starts_with("alpha")) {

@@ -351,6 +351,7 @@ async fn input_over_the_hosts_own_address_is_told_once_with_the_cure() {
     let mut config = swarm(dir.path(), &["alpha"]).remove(0);
     let port = config.zenoh.listen[0].rsplit(':').next().unwrap().to_owned();
     config.zenoh.listen = vec![format!("tcp/0.0.0.0:{port}")];
+    config.zenoh.security = Some(merganser::config::Security::None);
     config.save(&dir.path().join("alpha.toml")).unwrap();
     let mut agent = Command::new(env!("CARGO_BIN_EXE_merganser"));
     agent.args(["run", "-c", "alpha.toml"]).current_dir(dir.path());

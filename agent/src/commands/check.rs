@@ -1,7 +1,10 @@
 //! `merganser check`: is this configuration good, and what does it come to?
 
 use super::say;
-use crate::config::FileConfig;
+use crate::certificates::Problem;
+use crate::certificates::expiry::{self, Standing};
+use crate::config::{FileConfig, FileConfigError};
+use crate::link::session::Guard;
 use anyhow::Result;
 use merganser_protocol::ids::RobotId;
 use std::path::PathBuf;
@@ -21,9 +24,21 @@ pub struct CheckArgs {
 pub fn run(args: &CheckArgs) -> Result<bool> {
     let config = FileConfig::load(&args.config)?;
     config.identity()?;
+    let links = match Guard::of(&config)? {
+        Some(guard) => {
+            let certificate = &guard.credentials.certificate;
+            if certificate.standing(expiry::now()) == Standing::Expired {
+                let path = config.zenoh.certificate.clone().unwrap_or_default();
+                return Err(FileConfigError::from(Problem::Expired(certificate.last_day()).at(&path)).into());
+            }
+            format!("Links by TLS; certificate until {}.", certificate.last_day())
+        }
+        None if config.zenoh.security.is_some() => "Links are plain: zenoh.security = \"none\".".into(),
+        None => "Links are plain, and stay on this host.".into(),
+    };
     let id = config.roster.get(&config.robot).map(|key| RobotId::of_key(&key.to_bytes()).to_string());
     say(&format!(
-        "# {}: good. Robot {} of swarm {}, id {}, one of {}.\n",
+        "# {}: good. Robot {} of swarm {}, id {}, one of {}.\n# {links}\n",
         args.config.display(),
         config.robot,
         config.swarm,

@@ -6,6 +6,7 @@ use super::{BadInput, runtime, say};
 use crate::config::FileConfig;
 use crate::driver::Finished;
 use crate::host::{Host, Options};
+use crate::link::refusals::Refusals;
 use crate::link::scouting::Scouting;
 use crate::link::session::{self, LinkError};
 use crate::queue::{Drops, Inbox};
@@ -70,7 +71,7 @@ fn speed(text: &str) -> Result<f64, String> {
 /// If the configuration, the store, the core or Zenoh does not let it start.
 pub fn run(args: &RunArgs) -> Result<bool> {
     let config = FileConfig::load(&args.config)?;
-    telemetry::init(&config.log);
+    let refused = telemetry::init(&config.log);
     // What is made of a bag lies there until the agent ends.
     let mut scratch = None;
     if args.recording.is_none() {
@@ -78,7 +79,7 @@ pub fn run(args: &RunArgs) -> Result<bool> {
     }
     let recording = args.recording.as_ref().map(|path| open(path, args, &config, &mut scratch)).transpose()?;
     let runtime = runtime()?;
-    let finished = runtime.block_on(live(args, config, recording));
+    let finished = runtime.block_on(live(args, config, recording, refused));
     runtime.shutdown_timeout(Duration::from_millis(200)); // a job that still runs is of no use any more
     let finished = finished?;
     say(&format!("digest {}", finished.digest))?;
@@ -110,7 +111,12 @@ fn open(path: &Path, args: &RunArgs, config: &FileConfig, scratch: &mut Option<S
     })
 }
 
-async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recording>) -> Result<Finished> {
+async fn live(
+    args: &RunArgs,
+    mut config: FileConfig,
+    recording: Option<Recording>,
+    refused: Arc<Refusals>,
+) -> Result<Finished> {
     let stop = stop_signal()?;
     if let Some(recording) = &recording {
         suit(&mut config, recording);
@@ -118,7 +124,7 @@ async fn live(args: &RunArgs, mut config: FileConfig, recording: Option<Recordin
     let names_peers = !session::others(&config.zenoh).is_empty();
     let mut host = Host::start(config, Options { journal: args.journal.clone(), seed: args.seed }).await?;
     let inbox = host.inbox().clone();
-    let drops = tokio::spawn(tell_drops(inbox.drops.clone()));
+    let drops = tokio::spawn(tell_drops(inbox.drops.clone(), refused));
     let feed = tokio::spawn(feed(inbox, args.new_epoch, recording, args.speed));
     let feeding = feed.abort_handle();
     let scouting = host.take_scouting();
@@ -203,10 +209,16 @@ fn stop_signal() -> Result<impl Future<Output = ()> + Send + 'static> {
     })
 }
 
-async fn tell_drops(drops: Arc<Drops>) {
+async fn tell_drops(drops: Arc<Drops>, refused: Arc<Refusals>) {
     let mut seen = BTreeMap::new();
     loop {
         tokio::time::sleep(DROPS_EVERY).await;
+        for (refusal, count) in refused.take() {
+            let others = "refused: links, for other reasons";
+            if (0..count).fold(false, |first, _| first | drops.count_named_first(refusal.to_string(), others)) {
+                warn!(cure = refusal.cure(), "{refusal}; the next ones of this kind are only counted");
+            }
+        }
         for line in drops.news(&mut seen) {
             warn!("{line}");
         }

@@ -1,10 +1,10 @@
 //! `merganser watch`: a swarm from outside. A live table of what each robot says of itself, or every message that
 //! travels as a line of JSON. It only listens and asks for views: it holds no key and changes nothing.
 
-use super::{runtime, say};
-use crate::config::{LogConfig, LogFormat, ZenohConfig};
+use super::{BadInput, runtime, say};
+use crate::config::{FileConfig, LogConfig, LogFormat, ZenohConfig};
 use crate::keys;
-use crate::link::session::{self, Role};
+use crate::link::session::{self, Guard, Role};
 use crate::telemetry;
 use anyhow::{Context, Result, anyhow};
 use console::{Term, measure_text_width, pad_str, style};
@@ -15,6 +15,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
@@ -33,6 +34,9 @@ const SILENT: Duration = Duration::from_secs(3);
 /// What `merganser watch` can be told.
 #[derive(Clone, Debug, clap::Args)]
 pub struct WatchArgs {
+    /// Configuration of an observer: swarm, key, certificate, roster and endpoints, for a swarm that links by TLS.
+    #[arg(long, short, value_name = "FILE", conflicts_with = "swarm")]
+    pub config: Option<PathBuf>,
     /// The swarm to watch.
     #[arg(long, default_value = "demo", value_parser = name)]
     pub swarm: Name,
@@ -77,9 +81,23 @@ pub fn run(args: &WatchArgs) -> Result<bool> {
 }
 
 async fn watch(args: &WatchArgs) -> Result<bool> {
-    let zenoh = ZenohConfig { connect: args.connect.clone(), multicast: !args.no_multicast, ..ZenohConfig::default() };
+    let config = args.config.as_ref().map(|path| FileConfig::load(path)).transpose()?;
+    let guard = config.as_ref().map(Guard::of).transpose()?.flatten();
+    if let Some(robot) = guard.as_ref().and_then(|guard| guard.robot.as_ref()) {
+        return Err(BadInput::told(format!(
+            "{robot} is a robot, and views go by TLS to observers alone: name an observer's configuration, or look on from \
+             the robot itself by --no-multicast --connect tcp/127.0.0.1:7448"
+        )));
+    }
+    let mut zenoh = config.as_ref().map_or_else(ZenohConfig::default, |config| config.zenoh.clone());
+    zenoh.connect.extend(args.connect.iter().cloned());
+    zenoh.multicast &= !args.no_multicast;
     zenoh.validate()?;
-    let session = session::open(&zenoh, Role::Onlooker).await?;
+    if let Some(tls) = zenoh.connect.iter().find(|endpoint| guard.is_none() && endpoint.starts_with("tls/")) {
+        return Err(BadInput::told(format!("{tls} is TLS: name the configuration of an observer by --config")));
+    }
+    let session = session::open_guarded(&zenoh, Role::Onlooker, guard.as_ref()).await?;
+    let swarm = config.map_or_else(|| args.swarm.clone(), |config| config.swarm);
     let end = async {
         let time = args.secs.map(|secs| Duration::try_from_secs_f64(secs).unwrap_or_default());
         let time = async { tokio::time::sleep(time.unwrap_or(Duration::MAX)).await };
@@ -88,7 +106,8 @@ async fn watch(args: &WatchArgs) -> Result<bool> {
             _ = tokio::signal::ctrl_c() => {}
         }
     };
-    let seen = if args.json { messages(&session, &args.swarm, end).await } else { tables(&session, args, end).await };
+    let seen =
+        if args.json { messages(&session, &swarm, end).await } else { tables(&session, &swarm, args, end).await };
     session::close(&session, Duration::from_secs(2)).await;
     seen
 }
@@ -170,7 +189,7 @@ struct Seen {
 }
 
 /// Asks all robots for their views and shows a table, until `end`.
-async fn tables(session: &Session, args: &WatchArgs, end: impl Future<Output = ()>) -> Result<bool> {
+async fn tables(session: &Session, swarm: &Name, args: &WatchArgs, end: impl Future<Output = ()>) -> Result<bool> {
     let term = Term::stdout();
     let interval =
         Duration::try_from_secs_f64(args.interval).context("--interval: use a positive number of seconds")?;
@@ -184,8 +203,8 @@ async fn tables(session: &Session, args: &WatchArgs, end: impl Future<Output = (
             _ = ticks.tick() => {}
         }
         let (statuses, frames) = tokio::join!(
-            ask::<StatusView>(session, &args.swarm, "view/status"),
-            ask::<FramesView>(session, &args.swarm, "view/frames"),
+            ask::<StatusView>(session, swarm, "view/status"),
+            ask::<FramesView>(session, swarm, "view/frames"),
         );
         for (robot, status) in statuses {
             robots.entry(robot).or_default().status = Some((Instant::now(), status));
@@ -194,7 +213,7 @@ async fn tables(session: &Session, args: &WatchArgs, end: impl Future<Output = (
             let seen = robots.entry(robot).or_default();
             (seen.pairs, seen.suspects) = (frames.pairs, frames.suspects);
         }
-        let text = draw(&args.swarm, &robots);
+        let text = draw(swarm, &robots);
         if term.is_term() {
             term.clear_last_lines(drawn)?;
         }

@@ -2,15 +2,18 @@
 //! return, because an undrained handler blocks the whole link; what is sent leaves from a thread of its own, because
 //! sending may wait for a slow neighbour; every question ends in exactly one `Input::Answered` without bytes.
 
+pub mod access;
 mod allowance;
 mod door;
 mod hear;
 pub mod overhear;
+pub mod refusals;
 mod say;
 pub mod scouting;
 pub mod session;
 mod views;
 
+use crate::certificates::{Certificate, expiry};
 use crate::config::FileConfig;
 use crate::driver::{Network, Outgoing, Snapshots};
 use crate::keys;
@@ -18,7 +21,7 @@ use crate::queue::{Drops, Inbox};
 use door::Door;
 use merganser_protocol::agent::io::{AskToken, QueryKind};
 use merganser_protocol::ids::{Name, RobotId};
-use session::LinkError;
+use session::{Guard, LinkError};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -52,6 +55,8 @@ struct Shared {
     door: Door,
     swarm: Name,
     robot: Name,
+    /// By which others know it, if links are by TLS.
+    certificate: Option<Certificate>,
     inbox: Inbox,
     ids: BTreeMap<Name, RobotId>,
     names: BTreeMap<RobotId, Name>,
@@ -72,8 +77,8 @@ impl Link {
     ///
     /// # Errors
     /// [`LinkError`].
-    pub async fn open(config: &FileConfig, inbox: Inbox) -> Result<(Opened, Sender), LinkError> {
-        let session = session::open(&config.zenoh, session::Role::Robot).await?;
+    pub async fn open(config: &FileConfig, guard: Option<&Guard>, inbox: Inbox) -> Result<(Opened, Sender), LinkError> {
+        let session = session::open_guarded(&config.zenoh, session::Role::Robot, guard).await?;
         let door = Door::open(config).await?;
         let ids = config.roster.iter().map(|(name, key)| (name.clone(), RobotId::of_key(&key.to_bytes())));
         let ids: BTreeMap<Name, RobotId> = ids.collect();
@@ -82,6 +87,7 @@ impl Link {
             door,
             swarm: config.swarm.clone(),
             robot: config.robot.clone(),
+            certificate: guard.map(|guard| guard.credentials.certificate.clone()),
             inbox,
             names: ids.iter().map(|(name, id)| (*id, name.clone())).collect(),
             ids,
@@ -127,6 +133,9 @@ impl Opened {
         let mut tasks = vec![hear::start(&shared).await?];
         if let Some(session) = &shared.door.session {
             tasks.push(tokio::spawn(door::watch(session.clone(), config.zenoh.clone())));
+        }
+        if let Some(certificate) = &shared.certificate {
+            tasks.push(tokio::spawn(expiry::watch(certificate.clone())));
         }
         tasks.push(views::start(shared.clone(), snapshots, &config.debug, config.zenoh.message_bytes_max).await?);
         let key = keys::of(&shared.swarm, &shared.robot, keys::ALIVE);

@@ -1,9 +1,13 @@
-//! A Zenoh session as Merganser wants it: explicit endpoints, bounded messages, links that one side alone opens, and an
-//! access list of who may speak on which keys.
+//! A Zenoh session as Merganser wants it: explicit endpoints, bounded messages, links that one side alone opens, TLS with
+//! certificates on both sides where there are credentials, and an access list of who may speak on which keys.
 
-use crate::config::{Mode, ZenohConfig};
+use super::access;
+use crate::certificates::credentials::{Credentials, Members};
+use crate::config::{FileConfig, FileConfigError, Mode, ZenohConfig};
 use crate::keys;
 use crate::link::scouting::Place;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use merganser_protocol::ids::Name;
 use serde_json::{Value, json};
 use std::time::Duration;
@@ -65,12 +69,52 @@ pub enum Role {
     Onlooker,
 }
 
-/// Opens a session.
+/// What protects links: who we are, and who may be at their other ends.
+#[derive(Clone, Debug)]
+pub struct Guard {
+    /// Our authority, certificate and key.
+    pub credentials: Credentials,
+    /// The swarm that links are for.
+    pub swarm: Name,
+    /// The robot whose links these are; `None` if somebody only looks on.
+    pub robot: Option<Name>,
+    /// Who may link.
+    pub members: Members,
+}
+
+impl Guard {
+    /// Of a robot, or of an observer; `None` if links are plain.
+    ///
+    /// # Errors
+    /// [`FileConfigError`] if what TLS needs is missing or does not fit.
+    pub fn of(config: &FileConfig) -> Result<Option<Self>, FileConfigError> {
+        let guard = |credentials| Self {
+            credentials,
+            swarm: config.swarm.clone(),
+            robot: config.roster.contains_key(&config.robot).then(|| config.robot.clone()),
+            members: config.members(),
+        };
+        Ok(config.credentials()?.map(guard))
+    }
+}
+
+/// Opens a session with plain links.
 ///
 /// # Errors
 /// [`LinkError`].
 pub async fn open(config: &ZenohConfig, role: Role) -> Result<Session, LinkError> {
     opened(settings(config, role)?, &config.listen).await
+}
+
+/// Opens a session whose links are by TLS if there is a guard.
+///
+/// # Errors
+/// [`LinkError`].
+pub async fn open_guarded(config: &ZenohConfig, role: Role, guard: Option<&Guard>) -> Result<Session, LinkError> {
+    match guard {
+        Some(guard) => opened(guarded_settings(config, role, guard)?, &config.listen).await,
+        None => open(config, role).await,
+    }
 }
 
 /// Where the robot's own SLAM comes in.
@@ -132,8 +176,46 @@ fn settings(config: &ZenohConfig, role: Role) -> Result<Config, LinkError> {
         ("transport/link/tx/lease", json!((config.lease_secs * 1e3) as u64)),
         ("transport/link/rx/max_message_size", json!(message_bytes_max(config, role))),
         ("transport/shared_memory/enabled", json!(false)),
-        ("access_control", access(&feeding)),
+        ("access_control", access::of_anyone(&feeding)),
     ])
+}
+
+/// What opens and accepts links by TLS alone, with certificates of one authority on both sides; where names are checked
+/// is the access list. Zenoh's own check of names compares them to addresses, which robots change; and it also takes
+/// what the public authorities of the Web sign (zenoh #2711, #2764), so that without names in the list anyone could be
+/// called, who would then be told and could say nothing.
+pub fn tls(credentials: &Credentials) -> [(&'static str, Value); 9] {
+    let [authority, certificate, key] =
+        [credentials.authority.pem(), credentials.certificate.pem(), credentials.key_pem()]
+            .map(|pem| json!(STANDARD.encode(pem)));
+    [
+        ("transport/link/protocols", json!(["tls"])),
+        ("transport/link/tls/root_ca_certificate_base64", authority),
+        ("transport/link/tls/listen_certificate_base64", certificate.clone()),
+        ("transport/link/tls/listen_private_key_base64", key.clone()),
+        ("transport/link/tls/connect_certificate_base64", certificate),
+        ("transport/link/tls/connect_private_key_base64", key),
+        ("transport/link/tls/enable_mtls", json!(true)),
+        ("transport/link/tls/verify_name_on_connect", json!(false)),
+        ("transport/link/tls/close_link_on_expiration", json!(true)),
+    ]
+}
+
+fn guarded_settings(config: &ZenohConfig, role: Role, guard: &Guard) -> Result<Config, LinkError> {
+    let mut settings = settings(config, role)?;
+    let feeding = config.feeding_interfaces();
+    let feeding = guard.robot.as_ref().filter(|_| !feeding.is_empty()).map(|robot| (robot, feeding.as_slice()));
+    let list = match guard.robot {
+        Some(_) => access::by_name(&guard.swarm, &guard.members, config.mode == Mode::Router, feeding),
+        None => access::of_onlooker(&guard.swarm, &guard.members),
+    };
+    for (key, value) in tls(&guard.credentials).into_iter().chain([("access_control", list)]) {
+        settings.insert_json5(key, &value.to_string()).map_err(|error| {
+            let value = if key.contains("base64") { json!("…") } else { value };
+            refused_setting(key, value, error)
+        })?;
+    }
+    Ok(settings)
 }
 
 fn entry_settings(config: &ZenohConfig, entry: &Entry<'_>) -> Result<Config, LinkError> {
@@ -158,7 +240,7 @@ fn entry_settings(config: &ZenohConfig, entry: &Entry<'_>) -> Result<Config, Lin
                 "enabled": true,
                 "default_permission": "deny",
                 "rules": [
-                    rule("ask and declare", asking(), json!(["ingress", "egress"]), "**"),
+                    rule("ask and declare", access::asking(), json!(["ingress", "egress"]), "**"),
                     rule("show", json!(["put", "delete"]), json!(["egress"]), "**"),
                     rule("feed", json!(["put"]), json!(["ingress"]), &inputs),
                 ],
@@ -197,9 +279,10 @@ fn message_bytes_max(config: &ZenohConfig, role: Role) -> usize {
     config.message_bytes_max
 }
 
-/// An error of Zenoh without the places in its sources (` at /…/endpoint.rs:615.`), which help no user.
+/// An error of Zenoh without the places in its sources (` at /…/endpoint.rs:615.`), which help no user, and without the
+/// keys that it writes behind endpoints.
 pub fn in_words(error: impl std::fmt::Display) -> String {
-    let text = error.to_string();
+    let text = without_keys(&error.to_string());
     let mut words = String::new();
     let mut rest = text.as_str();
     while let Some(at) = rest.find(" at /") {
@@ -216,6 +299,20 @@ pub fn in_words(error: impl std::fmt::Display) -> String {
     words + rest
 }
 
+/// What stands behind `…_base64=` is nobody's business.
+fn without_keys(text: &str) -> String {
+    const BEGIN: &str = "_base64=";
+    let mut parts = text.split(BEGIN);
+    let mut words = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let end = part.find(|c: char| !(c.is_ascii_alphanumeric() || "+/=".contains(c))).unwrap_or(part.len());
+        words.push_str(BEGIN);
+        words.push('…');
+        words.push_str(&part[end..]);
+    }
+    words
+}
+
 /// The connect list without ourselves, so that all robots can share one list.
 pub fn others(config: &ZenohConfig) -> Vec<&String> {
     config.connect.iter().filter(|endpoint| !config.listen.contains(endpoint)).collect()
@@ -227,50 +324,6 @@ fn strategy(role: Role) -> Value {
     let among_peers = if role == Role::Robot { "greater-zid" } else { "always" };
     json!({"router": {"to_router": among_peers, "to_peer": among_peers},
            "peer": {"to_router": "always", "to_peer": among_peers}})
-}
-
-/// All messages but publications.
-fn asking() -> Value {
-    json!([
-        "query",
-        "reply",
-        "declare_subscriber",
-        "declare_queryable",
-        "liveliness_token",
-        "liveliness_query",
-        "declare_liveliness_subscriber"
-    ])
-}
-
-/// Everything may be asked, declared and sent. What may come in as a publication is what [`keys`] knows; if input is
-/// taken over `interfaces`, over these alone, and else from anyone, to be counted and refused. Zenoh looks at the
-/// interface of the last link: a neighbour that runs on this host and relays for others is trusted with what it relays.
-fn access(interfaces: &[String]) -> Value {
-    let inputs = interfaces.is_empty().then(|| "in/*".to_owned());
-    let table = keys::CHANNELS.iter().map(|channel| keys::channel(*channel).to_string()).chain(["view/*".into()]);
-    let heard: Vec<String> = table.chain(inputs).map(|rest| format!("{}/*/*/{rest}", keys::PREFIX)).collect();
-    let everything = json!(["**"]);
-    let rule = |id: &str, messages: Value, flows: Value, key_exprs: &Value| json!({"id": id, "permission": "allow", "messages": messages, "flows": flows, "key_exprs": key_exprs});
-    let publications = || json!(["put", "delete"]);
-    let mut rules = vec![
-        rule("ask and declare", asking(), json!(["ingress", "egress"]), &everything),
-        rule("send", publications(), json!(["egress"]), &everything),
-        rule("hear", publications(), json!(["ingress"]), &json!(heard)),
-    ];
-    let mut subjects = vec![json!({"id": "anyone"})];
-    let mut policies = vec![json!({"rules": ["ask and declare", "send", "hear"], "subjects": ["anyone"]})];
-    if !interfaces.is_empty() {
-        rules.push(rule("feed", publications(), json!(["ingress"]), &everything));
-        subjects.push(json!({"id": "these interfaces", "interfaces": interfaces}));
-        policies.push(json!({"rules": ["feed"], "subjects": ["these interfaces"]}));
-    }
-    json!({
-        "enabled": true,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    })
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@
 use super::allowance::Allowance;
 use super::session::LinkError;
 use super::{Shared, refused};
+use crate::certificates::expiry::{self, CertificateView};
 use crate::config::DebugConfig;
 use crate::driver::Snapshots;
 use crate::keys;
@@ -42,6 +43,8 @@ pub struct Shell {
     pub counts: BTreeMap<String, u64>,
     /// Where the robot's own SLAM connects, shown in `status`.
     pub input: Vec<String>,
+    /// How its certificate stands, if links are by TLS; shown in `status`.
+    pub certificate: Option<CertificateView>,
 }
 
 /// Views of a snapshot as JSON, a document for each, the large ones only if they are wanted.
@@ -50,6 +53,9 @@ pub fn render(snapshot: &Snapshot, wanted: &[&str], shell: &Shell) -> serde_json
     stats["shell"] = serde_json::to_value(&shell.counts)?;
     let mut status = serde_json::to_value(&snapshot.status)?;
     status["input"] = serde_json::to_value(&shell.input)?;
+    if let Some(certificate) = &shell.certificate {
+        status["certificate"] = serde_json::to_value(certificate)?;
+    }
     let mut views = BTreeMap::from([
         ("status", serde_json::to_vec(&status)?),
         ("frames", serde_json::to_vec(&snapshot.frames)?),
@@ -261,7 +267,11 @@ impl Server {
         }
         let large = wanted.iter().any(|view| LARGE.contains(view));
         let snapshot = if large { self.snapshots.take().await? } else { self.snapshots.overview().await? };
-        let shell = Shell { counts: self.shared.drops().counts(), input: self.shared.door.endpoints.clone() };
+        let shell = Shell {
+            counts: self.shared.drops().counts(),
+            input: self.shared.door.endpoints.clone(),
+            certificate: self.shared.certificate.as_ref().map(|certificate| certificate.view(expiry::now())),
+        };
         let rendered = render(&snapshot, wanted, &shell);
         let views = Arc::new(rendered.unwrap_or_else(|reason| {
             tracing::error!(%reason, "a view cannot be written as JSON; this is a bug");

@@ -2,7 +2,9 @@
 //! keyframes of a room, and waiting with an end.
 #![allow(dead_code, reason = "each test file uses its part")]
 
-use merganser::config::FileConfig;
+use merganser::certificates::Holder;
+use merganser::certificates::authority::Authority;
+use merganser::config::{FileConfig, Security};
 use merganser::host::{Host, Options};
 use merganser::trust::SecretKey;
 use merganser_protocol::agent::io::{Input, Output};
@@ -49,6 +51,36 @@ pub fn swarm(folder: &Path, names: &[&str]) -> Vec<FileConfig> {
         config
     };
     names.iter().enumerate().map(member).collect()
+}
+
+/// Links of all these robots by TLS, with certificates of an authority of their own; whom they know as observers and
+/// routers is given by name. Keys of observers are those of the names' places from 101.
+pub fn secured(folder: &Path, configs: &mut [FileConfig], observers: &[&str], routers: &[&str]) -> Authority {
+    let authority = Authority::generate(configs[0].swarm.clone(), 10).unwrap();
+    let ca = folder.join("authority.crt");
+    std::fs::write(&ca, authority.certificate().pem()).unwrap();
+    for config in &mut *configs {
+        let certificate = folder.join(format!("{}.crt", config.robot));
+        let holder = Holder::Robot(config.robot.clone());
+        let made = authority.issue(&holder, &config.roster[&config.robot], 100).unwrap();
+        std::fs::write(&certificate, made.pem()).unwrap();
+        let keys = observers.iter().zip(101..).map(|(n, byte)| (name(n), SecretKey::from_bytes([byte; 32]).public()));
+        config.observers = keys.collect();
+        let zenoh = &mut config.zenoh;
+        (zenoh.security, zenoh.certificate, zenoh.authority) =
+            (Some(Security::Tls), Some(certificate), Some(ca.clone()));
+        zenoh.routers = routers.iter().map(|n| name(n)).collect();
+        let by_tls = |endpoint: &String| endpoint.replace("tcp/", "tls/");
+        zenoh.listen = zenoh.listen.iter().map(by_tls).collect();
+        zenoh.connect = zenoh.connect.iter().map(by_tls).collect();
+        zenoh.input_listen = Some(vec![free_endpoint()]);
+    }
+    authority
+}
+
+pub fn free_endpoint() -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    format!("tcp/127.0.0.1:{}", listener.local_addr().unwrap().port())
 }
 
 pub async fn start(config: &FileConfig, journal: Option<&Path>) -> Host {

@@ -154,11 +154,20 @@ impl Air {
         serde_json::from_str::<serde_json::Value>(&shown).unwrap()[0]["overlimits"].as_u64().unwrap()
     }
 
+    /// Bytes that were carried from robot to robot so far, with all headers but those of Ethernet's.
+    pub fn carried_bytes(&self) -> u64 {
+        self.counted("carried", "bytes")
+    }
+
     fn count(&self, counter: &str) -> u64 {
+        self.counted(counter, "packets")
+    }
+
+    fn counted(&self, counter: &str, what: &str) -> u64 {
         let shown = self.bridge.run("nft", &format!("-j list counter {TABLE} {counter}")).unwrap();
         let shown: serde_json::Value = serde_json::from_str(&shown).unwrap();
         let objects = shown["nftables"].as_array().unwrap();
-        objects.iter().find_map(|object| object["counter"]["packets"].as_u64()).unwrap()
+        objects.iter().find_map(|object| object["counter"][what].as_u64()).unwrap()
     }
 
     fn nft(&self, command: &str) {

@@ -13,6 +13,7 @@
 mod air;
 #[path = "../common/mod.rs"]
 mod common;
+mod cost;
 mod robot;
 mod spectator;
 
@@ -30,7 +31,7 @@ const SECOND: Duration = Duration::from_secs(1);
 #[ignore = "smoke: root only, in network namespaces of its own"]
 fn a_killed_robot_resumes_and_all_hold_the_same() {
     let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
-    let mut fleet = Fleet::drive(&air, 8.0);
+    let mut fleet = Fleet::drive_guarded(&air, 8.0); // by TLS, as is recommended; the others by plain TCP
     let before = fleet.beta().until("beta writes", |seen| seen.own_submaps("beta") >= 2 && seen.status.entries >= 4);
     let killed = fleet.beta().kill();
     assert_eq!(killed.signal(), Some(9), "{killed}");
@@ -156,6 +157,15 @@ fn a_robot_that_only_scouts_ends_where_its_address_is_new_and_is_found_when_star
 
 #[test]
 #[ignore = "night: root only, in network namespaces of its own"]
+fn robots_that_only_scout_find_one_another_by_tls() {
+    let Some(air) = Air::open(&["alpha", "beta", "gamma"]) else { return };
+    let mut fleet = Fleet::scout_guarded(&air, 8.0);
+    fleet.until_all("everybody hears everybody", |seen| seen.neighbours().len() == 2);
+    fleet.end_alike();
+}
+
+#[test]
+#[ignore = "night: root only, in network namespaces of its own"]
 fn a_loss_of_5_percent_changes_nothing() {
     lossy(5);
 }
@@ -187,6 +197,21 @@ fn a_slow_link_is_enough() {
     for name in name_list() {
         assert!(air.slowed(name) > 0, "{name} was never held back");
     }
+}
+
+/// What links by TLS cost beside plain TCP. Prints figures; asks only that all arrives.
+#[test]
+#[ignore = "night: root only, in network namespaces of its own"]
+fn what_tls_costs() {
+    let Some(air) = Air::open(&["alpha", "beta"]) else { return };
+    cost::measure(&air);
+}
+
+/// Not a test: the ends of the link that `what_tls_costs` measures.
+#[test]
+#[ignore = "night: no test; another starts it"]
+fn end_of_a_link() {
+    cost::main();
 }
 
 /// Not a test: what the tests start in each robot's namespace (see the module).

@@ -2,9 +2,9 @@
 //! sees of it.
 
 use super::air::Air;
-use super::common::swarm;
+use super::common::{secured, swarm};
 use super::spectator::{PORT, ROBOT};
-use merganser::config::FileConfig;
+use merganser::config::{FileConfig, Security};
 use merganser_protocol::snapshot::{FramesView, StatsView, StatusView};
 use serde::Deserialize;
 use std::collections::BTreeSet;
@@ -42,19 +42,33 @@ impl<'a> Fleet<'a> {
     /// Three agents as a swarm is recommended to be set up (a full connect list and multicast), each fed with its
     /// recording, `speed` times faster than it was driven.
     pub fn drive(air: &'a Air, speed: f64) -> Self {
-        Self::start(air, speed, true)
+        Self::start(air, speed, true, false)
+    }
+
+    /// The same with links by TLS.
+    pub fn drive_guarded(air: &'a Air, speed: f64) -> Self {
+        Self::start(air, speed, true, true)
     }
 
     /// The same without a connect list.
     pub fn scout(air: &'a Air, speed: f64) -> Self {
-        Self::start(air, speed, false)
+        Self::start(air, speed, false, false)
     }
 
-    fn start(air: &'a Air, speed: f64, names_peers: bool) -> Self {
+    /// The same by TLS.
+    pub fn scout_guarded(air: &'a Air, speed: f64) -> Self {
+        Self::start(air, speed, false, true)
+    }
+
+    fn start(air: &'a Air, speed: f64, names_peers: bool, guarded: bool) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let names = name_list();
-        let configs = swarm(folder.path(), &names);
-        let endpoint = |name: &&str| format!("tcp/{}:{PORT}", air.address(name));
+        let mut configs = swarm(folder.path(), &names);
+        if guarded {
+            secured(folder.path(), &mut configs, &[], &[]);
+        }
+        let transport = if guarded { "tls" } else { "tcp" };
+        let endpoint = |name: &&str| format!("{transport}/{}:{PORT}", air.address(name));
         let connect: Vec<String> = names.iter().map(endpoint).collect();
         let robots = configs.into_iter().map(|config| {
             let own = endpoint(&config.robot.as_str());
@@ -166,7 +180,10 @@ impl Seen {
 impl<'a> Robot<'a> {
     fn new(air: &'a Air, home: &Path, config: FileConfig, connect: Vec<String>) -> Self {
         let mut config = FileConfig { core: Default::default(), ..config };
-        config.zenoh.listen = vec![format!("tcp/[::]:{PORT}")];
+        let security = *config.zenoh.security.get_or_insert(Security::None);
+        let everywhere = if security == Security::Tls { "tls/0.0.0.0" } else { "tcp/[::]" };
+        config.zenoh.listen = vec![format!("{everywhere}:{PORT}")];
+        config.zenoh.input_listen = None;
         config.zenoh.connect = connect;
         config.zenoh.multicast = true;
         let name = config.robot.to_string();

@@ -14,6 +14,8 @@ use zenoh::Session;
 pub const ROBOT: &str = "MERGANSER_TEST_SPECTATOR_OF";
 /// The port that all agents of these tests listen on.
 pub const PORT: u16 = 7447;
+/// Where each takes its own robot's input and shows its views, without a certificate: its host's loopback alone.
+const DOOR: u16 = merganser::config::DOOR_PORT;
 
 /// Time between two looks.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
@@ -31,7 +33,7 @@ pub fn main() {
 }
 
 async fn look(robot: &str) {
-    let connect = vec![format!("tcp/127.0.0.1:{PORT}")];
+    let connect = vec![format!("tcp/127.0.0.1:{DOOR}")];
     let zenoh = ZenohConfig { connect, multicast: false, gossip: false, ..ZenohConfig::default() };
     let session = session::open(&zenoh, Role::Onlooker).await.unwrap();
     loop {
