@@ -41,8 +41,7 @@ pub(super) fn read(path: &Path) -> Result<(Se3, Stamp), RecordingError> {
     let mut stamps = Vec::new();
     for (index, line) in lines.iter().enumerate() {
         if let Some(secs) = line.strip_prefix(STAMP) {
-            let stamp = number("stamp", secs.trim()).and_then(seconds);
-            stamps.push(stamp.map_err(|problem| problem.at(path, index + 1))?);
+            stamps.push(seconds(secs.trim()).map_err(|problem| problem.at(path, index + 1))?);
         }
     }
     match stamps.get(stamps.len() / 2) {

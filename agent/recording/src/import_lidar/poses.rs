@@ -21,8 +21,8 @@ enum Key {
     Line,
     /// By the first number.
     Index(u64),
-    /// By a time, s.
-    Secs(f64),
+    /// By a time.
+    Time(Stamp),
 }
 
 /// Poses of scans, `t_world_lidar`, as a table states them.
@@ -70,7 +70,7 @@ impl Poses {
     /// The scans with their poses, in the order of their numbers; a scan without one is an error, a pose without a scan
     /// is none.
     pub fn join(self, data: &Path, scans: BTreeMap<u64, PathBuf>) -> Result<Vec<Frame>, RecordingError> {
-        let is_timed = self.rows.iter().any(|(key, ..)| matches!(key, Key::Secs(_)))
+        let is_timed = self.rows.iter().any(|(key, ..)| matches!(key, Key::Time(_)))
             || (self.is_numbered() && !self.holds(&scans) && self.rows.len() == scans.len() && self.rises());
         if is_timed { self.by_order(scans) } else { self.by_number(data, scans) }
     }
@@ -142,22 +142,27 @@ impl Key {
     }
 
     fn stamp(&self) -> Result<Stamp, Problem> {
-        let secs = match self {
-            Self::Line => return Err(Problem::Data("states no time, as other lines do; state it first".into())),
-            Self::Index(index) => *index as f64,
-            Self::Secs(secs) => *secs,
-        };
-        seconds(secs)
+        match self {
+            Self::Line => Err(Problem::Data("states no time, as other lines do; state it first".into())),
+            Self::Index(index) => seconds(&index.to_string()),
+            Self::Time(stamp) => Ok(*stamp),
+        }
     }
 }
 
-/// A time in seconds.
-pub(super) fn seconds(secs: f64) -> Result<Stamp, Problem> {
-    if secs.abs() <= SECS_MAX {
-        // In two parts, since a time of today in nanoseconds is beyond what an f64 tells apart.
-        return Ok(Stamp(secs.trunc() as i64 * 1_000_000_000 + (secs.fract() * 1e9).round() as i64));
+/// A time that is written in seconds, to the nanosecond, which an `f64` of today's seconds does not tell apart.
+pub(super) fn seconds(text: &str) -> Result<Stamp, Problem> {
+    let secs = number("time", text)?;
+    if secs.abs() > SECS_MAX {
+        return Err(Problem::Data(format!("the time {secs} is none in seconds; write seconds, as TUM's tables do")));
     }
-    Err(Problem::Data(format!("the time {secs} is none in seconds; write seconds, as TUM's tables do")))
+    let (whole, part) = text.split_once('.').unwrap_or((text, ""));
+    let digits: String = part.chars().chain(core::iter::repeat('0')).take(9).collect();
+    let nanos = match (whole.parse::<i64>(), digits.parse::<i64>()) {
+        (Ok(whole), Ok(nanos)) if whole >= 0 && !text.starts_with('-') => whole * 1_000_000_000 + nanos,
+        _ => (secs * 1e9).round() as i64,
+    };
+    Ok(Stamp(nanos))
 }
 
 fn row(words: &[&str]) -> Result<(Key, Se3), Problem> {
@@ -167,7 +172,7 @@ fn row(words: &[&str]) -> Result<(Key, Se3), Problem> {
             let index = name.strip_prefix('v').unwrap_or(name);
             let key = match index.parse() {
                 Ok(index) => Key::Index(index),
-                Err(_) => Key::Secs(number("index", index)?),
+                Err(_) => Key::Time(seconds(index)?),
             };
             let mut v = [0.0; 7];
             v.copy_from_slice(&numbers(rest)?);
