@@ -27,7 +27,7 @@ pub enum Kind {
     Recordings,
     /// `frame-XXXXXX.depth.png`, `camera-intrinsics.txt`, `poses_all_1000.txt`.
     SevenScenes,
-    /// `graph.txt` and `NNNNNN/points.bin`, or `NNNNNN.bin` and `poses.txt`.
+    /// `graph.txt` and `NNNNNN/points.bin`, a dump of GLIM, or `NNNNNN.bin` (`.pcd`, `.ply`) and `poses.txt`.
     Lidar,
     /// `*.mcap`, `*.db3`, `*.bag`, or folders of them with `metadata.yaml`: ROS bags.
     Bags,
@@ -64,7 +64,7 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
     if any(&|name| name.ends_with(import_rgbd::DEPTH_SUFFIX)) {
         return Ok(Kind::SevenScenes);
     }
-    if any(&|name| name == import_lidar::GRAPH || name.ends_with(import_lidar::SCAN_SUFFIX)) {
+    if import_lidar::is_scans(folder, &names) {
         return Ok(Kind::Lidar);
     }
     if any(&|name| import_mrclam::robot(name).is_some()) {
@@ -82,14 +82,16 @@ pub fn detect(folder: &Path) -> Result<Kind, RecordingError> {
         }
         (Some(_), _) => return Ok(Kind::Bags),
         (None, Some(_)) => return Ok(Kind::Carmen),
+        (None, None) if import_lidar::is_dump(folder, &names) => return Ok(Kind::Lidar),
         (None, None) => {}
     }
     let why = format!(
         "nothing here can be fed to robots; expected folders with a {MANIFEST}, 7-Scenes frames (*{}), LiDAR scans \
-         ({} with NNNNNN/points.bin, or NNNNNN.bin with {}), a CARMEN log (*.clf or *.log, perhaps packed: \
+         ({} with NNNNNN/points.bin, a dump of GLIM, or NNNNNN{}, .pcd or .ply with {}), a CARMEN log (*.clf or *.log, perhaps packed: \
          .bz2, .xz), MRCLAM logs (RobotN_Odometry.dat), or ROS bags (*.mcap, *.db3, *.bag)",
         import_rgbd::DEPTH_SUFFIX,
         import_lidar::GRAPH,
+        import_lidar::SCAN_SUFFIX,
         import_lidar::POSES,
     );
     Err(Problem::Data(why).of(folder))
