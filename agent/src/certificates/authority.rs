@@ -122,8 +122,11 @@ impl Authority {
     /// # Errors
     /// [`CertificateError`].
     pub fn save(&self, files: &Files) -> Result<(), CertificateError> {
-        write_new(&files.key, &self.key.serialize_pem(), 0o600)?;
-        write_new(&files.certificate, self.certificate.pem(), 0o644)
+        write_new(&files.certificate, self.certificate.pem(), 0o644)?;
+        write_new(&files.key, &self.key.serialize_pem(), 0o600).inspect_err(|_| {
+            // Beside another key it would be of no use, and in the way of the next try.
+            let _ = fs::remove_file(&files.certificate);
+        })
     }
 
     /// The swarm that it speaks for.

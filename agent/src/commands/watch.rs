@@ -277,7 +277,9 @@ fn draw(swarm: &Name, robots: &BTreeMap<Name, Seen>) -> String {
         ]);
     }
     if rows.len() == 1 {
-        return format!("swarm {swarm}: no robot answers\n");
+        return format!(
+            "swarm {swarm}: no robot answers (where links are by TLS, name an observer's configuration: --config)\n"
+        );
     }
     let mut text = format!("swarm {swarm}\n");
     lay_out(&mut text, &rows);

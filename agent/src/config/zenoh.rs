@@ -165,8 +165,8 @@ impl ZenohConfig {
                     );
                     return Err(ValueError { key: key.into(), mend });
                 }
-                if text.contains('#') {
-                    // Zenoh takes settings there, which would outweigh ours.
+                if text.starts_with(TLS) && text.contains('#') {
+                    // Zenoh takes settings there, which would outweigh ours: other certificates, or none.
                     let mend = format!("{text:?} has settings after '#'; write the endpoint alone");
                     return Err(ValueError { key: key.into(), mend });
                 }

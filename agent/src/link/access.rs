@@ -56,9 +56,12 @@ pub fn by_name(swarm: &Name, members: &Members, relays: bool, feeding: Option<(&
     let everything = [format!("{}/{swarm}/**", keys::PREFIX)];
     let alive = all(&[keys::ALIVE.into()]);
 
+    // Input is never relayed: a robot would sign what another fed to it.
+    let published = all(&[&said[..], &views].concat());
     let relay = vec![
         list.rule("relay", asking(), BOTH, &everything),
-        list.rule("relay publications", publications(), BOTH, &everything),
+        list.rule("pass on", publications(), OUT, &everything),
+        list.rule("relay publications", publications(), IN, &published),
     ];
     if !members.routers.is_empty() {
         list.policy(named("all routers", members.routers.iter().cloned().map(Holder::Router)), &relay);
@@ -69,6 +72,7 @@ pub fn by_name(swarm: &Name, members: &Members, relays: bool, feeding: Option<(&
     } else if !members.robots.is_empty() {
         let rules = [
             list.rule("ask", json!(["query"]), BOTH, &all(&asked)),
+            list.rule("pass on questions for views", json!(["query"]), OUT, &all(&views)),
             list.rule("listen", json!(["declare_subscriber"]), IN, &all(&said)),
             list.rule("watch presence", presence(), BOTH, &alive),
             list.rule("tell", publications(), OUT, &all(&said)),
@@ -176,5 +180,38 @@ impl List {
             "subjects": self.subjects,
             "policies": self.policies,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Whoever relays passes on no input: a robot would sign what another fed to it. The own doors take it all the same.
+    #[test]
+    fn input_is_relayed_by_nobody() {
+        let name = |text: &str| Name::new(text).unwrap();
+        let members = Members {
+            robots: [name("alpha"), name("beta")].into(),
+            routers: [name("hub")].into(),
+            observers: [name("lena")].into(),
+        };
+        let doors = ["lo".to_owned()];
+        for relays in [false, true] {
+            let list = by_name(&name("field"), &members, relays, Some((&name("alpha"), &doors)));
+            let rules = list["rules"].as_array().unwrap();
+            let feeds = |rule: &&Value| {
+                let has = |field: &str, what: &str| rule[field].as_array().unwrap().iter().any(|x| x == what);
+                let covers = |key: &Value| {
+                    let pattern = key.as_str().unwrap();
+                    pattern.ends_with("/**") || pattern.contains("/in/")
+                };
+                has("messages", "put")
+                    && has("flows", "ingress")
+                    && rule["key_exprs"].as_array().unwrap().iter().any(covers)
+            };
+            let feeding: Vec<&Value> = rules.iter().filter(feeds).map(|rule| &rule["id"]).collect();
+            assert_eq!(feeding, ["feed"], "relays: {relays}");
+        }
     }
 }

@@ -16,6 +16,10 @@ const ACCEPTS: &str = "zenoh_link_tls";
 const CONNECTS: &str = "zenoh::net::runtime::orchestrator";
 /// What Zenoh warns of at each link, since we told it not to compare names to addresses.
 const NO_NEWS: &str = "Skipping name verification";
+/// So a line says that an endpoint of our own configuration is meant. Others come by multicast, which anybody may send:
+/// their names would fill the table of reasons.
+const CONFIGURED: &str = "configured peer";
+const FOUND: &str = "a peer that was found by multicast";
 /// Reasons kept apart until they are taken.
 const REASONS_MAX: usize = 32;
 /// Longest reason kept, in characters.
@@ -52,6 +56,9 @@ impl Refusal {
             .min();
         let reason = short(rest[..end.unwrap_or(rest.len())].trim_end_matches(['.', ' ']));
         let called = (target == CONNECTS).then(|| {
+            if !line.contains(CONFIGURED) {
+                return FOUND.to_owned();
+            }
             let begin = line.find("tls/").map_or("", |begin| &line[begin..]);
             short(begin.split(|c: char| c.is_whitespace() || "!,;?#".contains(c)).next().unwrap_or_default())
         });
@@ -168,6 +175,11 @@ mod tests {
                  IpAddress(V4(Ipv4Addr([10, 0, 0, 2]))): invalid peer certificate: BadSignature at \
                  /x/unicast.rs:1.. Retry in 1s.",
                 Some("refused: a link to tls/10.0.0.2:7447: invalid peer certificate: BadSignature"),
+            ),
+            (
+                CONNECTS,
+                "Unable to connect any locator of scouted peer 1f: [tls/10.0.0.9:1]: invalid peer certificate: BadSignature",
+                Some("refused: a link to a peer that was found by multicast: invalid peer certificate: BadSignature"),
             ),
             (CONNECTS, "Unable to connect to configured peer tls/10.0.0.2:7447! No route to host. Retry in 1s.", None),
             (

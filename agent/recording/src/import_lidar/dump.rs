@@ -54,15 +54,16 @@ pub(super) struct Dump {
 /// Whether scans lie in the folder, by the names of what does.
 pub(crate) fn is_scans(folder: &Path, names: &[String]) -> bool {
     let is_own = |name: &String| *name == GRAPH || name.ends_with(SCAN_SUFFIX);
-    names.iter().any(is_own)
-        || names.iter().any(|name| is_submap(&folder.join(name)))
-        || folder.join("velodyne").is_dir()
+    names.iter().any(is_own) || names.iter().any(|name| is_submap(&folder.join(name)))
 }
 
 /// Whether clouds of other formats, or a dump that is to be named, lie in a folder that holds nothing else.
 pub(crate) fn is_dump(folder: &Path, names: &[String]) -> bool {
     let is_cloud = |name: &String| format_of(name).is_some();
-    names.iter().any(is_cloud) || folder.join("Scans").is_dir() || is_fast_lio(folder)
+    names.iter().any(is_cloud)
+        || folder.join("velodyne").is_dir()
+        || folder.join("Scans").is_dir()
+        || is_fast_lio(folder)
 }
 
 fn is_submap(folder: &Path) -> bool {

@@ -37,9 +37,11 @@ pub(super) fn mover<'a>(poses: impl Iterator<Item = &'a Se3>) -> Mover {
         if let Some(last) = last.replace(*pose) {
             let step = last.inverse() * *pose;
             way += step.translation.abs();
-            turn += step.rotation.log().abs();
+            turn += step.rotation.log();
         }
     }
+    // What turns to and fro, as a car that rolls on a straight road, is no turn.
+    let turn = turn.abs();
     let is_forward = way.norm() >= WAY_MIN && way.z >= FORWARD * way.norm();
     let is_upright = turn.norm() < TURN_MIN || turn.y > turn.z;
     if is_forward && is_upright { Mover::Camera } else { Mover::Other }
@@ -93,4 +95,32 @@ fn read_transform(path: &Path) -> Result<Se3, RecordingError> {
     let why =
         "has no line `Tr:` of twelve numbers, the transform from the LiDAR to the camera; take the sequence's own";
     Err(Problem::Data(why.into()).of(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use merganser_protocol::geometry::So3;
+
+    /// A car on a straight road rolls to and fro by more than it turns.
+    #[test]
+    fn a_camera_that_rolls_on_a_straight_road_is_one() {
+        let step = |k: i32| {
+            let roll = if k % 2 == 0 { 0.02 } else { -0.02 };
+            Se3::new(So3::exp(&Vector3::new(0.0, 0.003, roll)), Vector3::new(0.0, 0.0, 0.8))
+        };
+        let camera: Vec<Se3> =
+            (0..60).scan(Se3::identity(), |at, k| Some(std::mem::replace(at, *at * step(k)))).collect();
+        assert!(mover(camera.iter()) == Mover::Camera);
+        // The same way by a LiDAR: x forward, z up.
+        let lidar: Vec<Se3> = camera
+            .iter()
+            .map(|t| {
+                let turn = t.rotation.log();
+                let at = t.translation;
+                Se3::new(So3::exp(&Vector3::new(turn.z, -turn.x, -turn.y)), Vector3::new(at.z, -at.x, -at.y))
+            })
+            .collect();
+        assert!(mover(lidar.iter()) == Mover::Other);
+    }
 }

@@ -1,6 +1,7 @@
 //! Tables of poses, one a line: twelve numbers (the upper rows of a matrix, KITTI's) for the scan of the line's number;
 //! `index x y z qx qy qz qw` (in a graph `vI x y z …`); or, with a time in seconds before the pose, TUM's.
 
+use super::TURN_MAX;
 use super::dump::Frame;
 use crate::bounded::read_text;
 use crate::error::{Problem, RecordingError};
@@ -71,12 +72,13 @@ impl Poses {
     /// is none.
     pub fn join(self, data: &Path, scans: BTreeMap<u64, PathBuf>) -> Result<Vec<Frame>, RecordingError> {
         let is_timed = self.rows.iter().any(|(key, ..)| matches!(key, Key::Time(_)))
-            || (self.is_numbered() && !self.holds(&scans) && self.rows.len() == scans.len() && self.rises());
+            || (self.counts_seconds() && !self.holds(&scans) && self.rows.len() == scans.len() && self.rises());
         if is_timed { self.by_order(scans) } else { self.by_number(data, scans) }
     }
 
-    fn is_numbered(&self) -> bool {
-        self.rows.iter().all(|(key, ..)| matches!(key, Key::Index(_)))
+    /// Whole numbers that are too large to count scans are whole seconds.
+    fn counts_seconds(&self) -> bool {
+        self.rows.iter().all(|(key, ..)| key.index().is_some_and(|index| index > TURN_MAX))
     }
 
     fn holds(&self, scans: &BTreeMap<u64, PathBuf>) -> bool {

@@ -18,6 +18,9 @@ const COMMON_WAY_M: f64 = 10.0;
 /// Standard deviations of a relation of two true poses, m and rad: published poses and relations close loops to 2 to
 /// 7 cm, landmarks place a submap no better.
 pub const TRUTH: (f64, f64) = (0.05, 0.01);
+/// A normalised error says something of a covariance only where the truth is sharp: of anchors no more doubtful than
+/// this, m and rad.
+const SHARP: f64 = 0.05;
 
 /// Two robots.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -258,21 +261,21 @@ impl Judge<'_> {
     }
 
     fn nees(&self, view: &Snapshot, judged: &mut Judged) {
+        let sharp = |name: &str| self.anchor(name).map(|(_, anchor)| anchor).filter(|anchor| anchor.doubt <= SHARP);
         for middle in view.frames.pairs.iter().filter_map(|pair| pair.middle.as_ref()) {
-            let ends = (self.anchor(&middle.i), self.anchor(&middle.j), relation(&middle.t_i_j));
-            let (Some((_, i)), Some((_, j)), Some(stated)) = ends else { continue };
+            let ends = (sharp(&middle.i), sharp(&middle.j), relation(&middle.t_i_j));
+            let (Some(i), Some(j), Some(stated)) = ends else { continue };
             let (d2, dof) = self.distance_squared(&stated, &Truth::between(&i, &j));
             judged.nees_pairs.push(d2 / dof as f64);
         }
         let origin = view.map.submaps.iter().find_map(|submap| {
             let is_first = submap.frame == view.frames.own && submap.index == 0;
-            let (_, Anchor { t_world_anchor, doubt }) =
-                self.anchor(&format!("{}#0", submap.frame)).filter(|_| is_first)?;
+            let Anchor { t_world_anchor, doubt } = sharp(&format!("{}#0", submap.frame)).filter(|_| is_first)?;
             Some(Anchor { t_world_anchor: t_world_anchor * pose(&submap.t_frame_anchor)?.inverse(), doubt })
         });
         let Some(own) = origin else { return };
         for submap in &view.map.submaps {
-            let Some((_, anchor)) = self.anchor(&format!("{}#{}", submap.frame, submap.index)) else { continue };
+            let Some(anchor) = sharp(&format!("{}#{}", submap.frame, submap.index)) else { continue };
             let Some(stated) = submap.t_own_anchor.as_ref().and_then(relation) else { continue };
             // The first is where it is by definition.
             if submap.frame != view.frames.own || submap.index > 0 {
