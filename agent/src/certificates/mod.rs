@@ -245,22 +245,41 @@ impl Certificate {
         &self.pem
     }
 
-    /// Whether `authority` may sign, and signed this one.
+    /// Whether `authority` may sign, and signed this one. What the signature does not cover must be as it is due, to the
+    /// bit: a certificate has one form.
     pub fn is_signed_by(&self, authority: &Self) -> bool {
         let parsed = (X509Certificate::from_der(&self.der), X509Certificate::from_der(&authority.der));
         let (Ok((_, own)), Ok((_, theirs))) = parsed else { return false };
         let Ok(signature) = Signature::from_slice(&own.signature_value.data) else { return false };
         let Ok(key) = VerifyingKey::from_bytes(&authority.key.to_bytes()) else { return false };
+        let signed = own.tbs_certificate.as_ref();
         authority.is_authority
             && own.issuer() == theirs.subject()
-            && own.signature_algorithm.algorithm.to_id_string() == ED25519
-            && key.verify_strict(own.tbs_certificate.as_ref(), &signature).is_ok()
+            && self.der == sealed(signed, &own.signature_value.data)
+            && key.verify_strict(signed, &signature).is_ok()
     }
 
     /// Its last day, as in `2027-11-29`.
     pub fn last_day(&self) -> String {
         day(self.not_after)
     }
+}
+
+/// DER of a certificate: a sequence of what is signed, the algorithm, which is Ed25519, and the signature, a bit string.
+fn sealed(signed: &[u8], signature: &[u8]) -> Vec<u8> {
+    const SEQUENCE: u8 = 0x30;
+    const ALGORITHM: [u8; 7] = [SEQUENCE, 5, 6, 3, 0x2b, 0x65, 0x70];
+    const BITS: [u8; 3] = [3, 65, 0];
+    let content = [signed, &ALGORITHM, &BITS, signature].concat();
+    let length = content.len().to_be_bytes();
+    let first = length.iter().take_while(|byte| **byte == 0).count();
+    let length = &length[first..];
+    let head = if let [short @ 0..=127] = *length {
+        vec![SEQUENCE, short]
+    } else {
+        [&[SEQUENCE, 0x80 | length.len() as u8], length].concat()
+    };
+    [head, content].concat()
 }
 
 /// The day of a second since 1970, as in `2027-11-29`.

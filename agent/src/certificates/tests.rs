@@ -190,6 +190,23 @@ fn zenoh_takes_a_routers_file_and_its_list_names_everybody() {
     assert!(text.lines().take(2).all(|line| line.starts_with("// ")));
 }
 
+/// A certificate has one form: no byte can be another one, also of those that the signature does not cover.
+#[test]
+fn no_byte_of_a_certificate_can_be_another() {
+    let authority = Authority::generate(name("demo"), 10).unwrap();
+    let made = authority.issue(&robot("alpha"), &key(7).public(), DAYS).unwrap();
+    assert!(made.is_signed_by(authority.certificate()));
+    for at in 0..made.der.len() {
+        for flip in [1, 4, 64, 128, 255] {
+            let mut der = made.der.clone();
+            der[at] ^= flip;
+            if let Ok(read) = Certificate::parse(pem("CERTIFICATE", &der).as_bytes()) {
+                assert!(!read.is_signed_by(authority.certificate()), "byte {at} with {flip}");
+            }
+        }
+    }
+}
+
 proptest! {
     /// Whatever a file holds, reading it ends in one line and without a panic.
     #[test]
