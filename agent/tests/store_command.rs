@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 use ed25519_dalek::SigningKey;
-use merganser::config::FileConfig;
+use merganser::config::{FileConfig, Security};
 use merganser::store;
 use merganser::trust::SecretKey;
 use merganser_protocol::agent::io::Record;
@@ -34,7 +34,9 @@ fn log(key: u8, epoch: u32, len: u32, swarm: &str) -> Vec<Record> {
 fn write(folder: &Path, records: &[Record]) -> FileConfig {
     let key = |k: u8| SecretKey::from_bytes([k; 32]).public();
     let roster = [(name("alpha"), key(1)), (name("beta"), key(2))].into();
-    FileConfig::new(name("test"), name("alpha"), "alpha.key".into(), roster).save(&folder.join("a.toml")).unwrap();
+    let mut plain = FileConfig::new(name("test"), name("alpha"), "alpha.key".into(), roster);
+    plain.zenoh.security = Some(Security::None);
+    plain.save(&folder.join("a.toml")).unwrap();
     let config = FileConfig::load(&folder.join("a.toml")).unwrap();
     store::open(&config).unwrap().store.commit(records.iter()).unwrap();
     config
