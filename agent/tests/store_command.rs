@@ -36,6 +36,7 @@ fn write(folder: &Path, records: &[Record]) -> FileConfig {
     let roster = [(name("alpha"), key(1)), (name("beta"), key(2))].into();
     let mut plain = FileConfig::new(name("test"), name("alpha"), "alpha.key".into(), roster);
     plain.zenoh.security = Some(Security::None);
+    plain.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
     plain.save(&folder.join("a.toml")).unwrap();
     let config = FileConfig::load(&folder.join("a.toml")).unwrap();
     store::open(&config).unwrap().store.commit(records.iter()).unwrap();
