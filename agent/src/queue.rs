@@ -261,17 +261,17 @@ impl Drops {
 
     /// Counts one; whether it is the first that is counted for this reason.
     pub fn count_first(&self, reason: impl Into<String>) -> bool {
-        count(&self.reasons, reason.into(), REASONS_MAX, "other")
+        count(&self.reasons, reason.into(), 1, REASONS_MAX, "other")
     }
 
     /// Counts one under a text that names a robot, or, if too many are named already, under `others`.
     pub fn count_named(&self, reason: String, others: &str) {
-        self.count_named_first(reason, others);
+        self.count_named_times(reason, 1, others);
     }
 
-    /// The same; whether it is the first that is counted there.
-    pub fn count_named_first(&self, reason: String, others: &str) -> bool {
-        count(&self.named, reason, NAMES_MAX, others)
+    /// Counts as many; whether they are the first that are counted there.
+    pub fn count_named_times(&self, reason: String, times: u64, others: &str) -> bool {
+        count(&self.named, reason, times, NAMES_MAX, others)
     }
 
     /// All counters.
@@ -295,14 +295,15 @@ impl Drops {
     }
 }
 
-fn count(counters: &Mutex<Counters>, mut reason: String, limit: usize, rest: &str) -> bool {
+fn count(counters: &Mutex<Counters>, mut reason: String, times: u64, limit: usize, rest: &str) -> bool {
     let mut counters = counters.lock().unwrap_or_else(PoisonError::into_inner);
     if counters.len() >= limit && !counters.contains_key(&reason) {
         reason = rest.into();
     }
     let count = counters.entry(reason).or_default();
-    *count = count.saturating_add(1);
-    *count == 1
+    let is_first = *count == 0;
+    *count = count.saturating_add(times);
+    is_first
 }
 
 #[cfg(test)]

@@ -92,6 +92,19 @@ fn a_generated_key_makes_a_good_configuration() {
     good(&router);
     let mode = std::fs::metadata(dir.path().join("hub.json5")).unwrap().permissions().mode();
     assert_eq!(mode & 0o777, 0o600, "it holds a key");
+
+    let line = text(&merganser(&["keys", "generate", "--name", "laptop"], dir.path()).stdout);
+    let laptop = filled.replace("# [observers]", &format!("[observers]\n{line}\n#")).replacen("\"alpha", "\"laptop", 2);
+    let laptop = laptop.replace("alpha.crt", "laptop.crt");
+    std::fs::write(dir.path().join("laptop.toml"), laptop).unwrap();
+    let without = merganser(&["check", "-c", "laptop.toml"], dir.path());
+    assert_eq!(without.status.code(), Some(2));
+    assert!(text(&without.stderr).contains("laptop.crt: No such file"), "{}", text(&without.stderr));
+    good(&["keys", "certificate", "--authority", "demo.authority.key", "-c", "laptop.toml"]);
+    let checked = merganser(&["check", "-c", "laptop.toml"], dir.path());
+    assert_eq!(checked.status.code(), Some(0), "{}", text(&checked.stderr));
+    assert!(text(&checked.stdout).starts_with("# laptop.toml: good. Observer laptop of swarm demo, of 1 robots"));
+
     good(&["keys", "authority", "--swarm", "other"]);
     let mixed = ["keys", "certificate", "--authority", "other.authority.key", "-c", "a.toml"];
     let mixed = merganser(&mixed, dir.path());

@@ -5,30 +5,16 @@
 
 mod common;
 
-use common::{PATIENCE, Puppet, keyframe, name, start, swarm, until};
-use merganser::config::FileConfig;
-use merganser::driver::Clock;
+use common::{PATIENCE, Puppet, free_endpoint, keyframe, name, puppet, start, swarm, until};
 use merganser::host::Host;
 use merganser::keys;
 use merganser::link::session;
 use merganser::observation::KeyframeMessage;
-use merganser::store;
 use merganser_protocol::agent::io::{Channel, Input};
 use serde_json::{Value, json};
-use std::net::TcpListener;
 use std::time::Duration;
 use zenoh::Session;
 use zenoh::qos::CongestionControl;
-
-async fn puppet(config: &FileConfig, core: &Puppet) -> Host {
-    let store = store::open(config).unwrap().store;
-    Host::assemble(config, core.clone(), store, None, Clock::start()).await.unwrap()
-}
-
-fn free_endpoint() -> String {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    format!("tcp/127.0.0.1:{}", listener.local_addr().unwrap().port())
-}
 
 /// A session like that of a SLAM: of plain Zenoh, which knows nothing of ours.
 async fn plain(mode: &str, connect: &str, more: &[(&str, Value)]) -> zenoh::Result<Session> {

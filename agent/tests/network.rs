@@ -4,10 +4,8 @@
 
 mod common;
 
-use common::{PATIENCE, Puppet, keyframe, name, start, swarm, until};
+use common::{PATIENCE, Puppet, id, keyframe, name, puppet, start, swarm, until};
 use merganser::config::{FileConfig, ZenohConfig};
-use merganser::driver::Clock;
-use merganser::host::Host;
 use merganser::keys;
 use merganser::link::session::{self, Role};
 use merganser::observation::{KeyframeMessage, POINTS_MAX};
@@ -20,15 +18,6 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 use zenoh::Session;
 use zenoh::qos::CongestionControl;
-
-async fn puppet(config: &FileConfig, core: &Puppet) -> Host {
-    let store = store::open(config).unwrap().store;
-    Host::assemble(config, core.clone(), store, None, Clock::start()).await.unwrap()
-}
-
-fn id(config: &FileConfig) -> RobotId {
-    RobotId::of_key(&config.roster[&config.robot].to_bytes())
-}
 
 async fn onlooker(config: &FileConfig) -> Session {
     let zenoh = ZenohConfig { connect: config.zenoh.listen.clone(), multicast: false, ..ZenohConfig::default() };

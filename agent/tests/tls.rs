@@ -5,18 +5,16 @@
 mod common;
 
 use base64::Engine as _;
-use common::{PATIENCE, Puppet, free_endpoint, name, secured, start, swarm, until};
+use common::{PATIENCE, Puppet, free_endpoint, id, name, puppet, secured, start, swarm, until};
 use merganser::certificates::authority::{Authority, key_pem};
 use merganser::certificates::router::Router;
 use merganser::certificates::{Certificate, Holder};
 use merganser::config::{FileConfig, Mode};
-use merganser::driver::Clock;
 use merganser::host::Host;
 use merganser::keys;
 use merganser::link::refusals::{self, Refusals};
 use merganser::link::session;
 use merganser::recording::Recording;
-use merganser::store;
 use merganser::trust::SecretKey;
 use merganser_protocol::agent::io::{Channel, Command, Input, Output, QueryId, QueryKind};
 use merganser_protocol::ids::RobotId;
@@ -29,15 +27,6 @@ use time::OffsetDateTime;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use zenoh::Session;
-
-async fn puppet(config: &FileConfig, core: &Puppet) -> Host {
-    let store = store::open(config).unwrap().store;
-    Host::assemble(config, core.clone(), store, None, Clock::start()).await.unwrap()
-}
-
-fn id(config: &FileConfig) -> RobotId {
-    RobotId::of_key(&config.roster[&config.robot].to_bytes())
-}
 
 fn sees(robot: RobotId, wanted: bool) -> impl Fn(&Input) -> bool {
     move |input| matches!(input, Input::Neighbour { robot: r, up } if *r == robot && *up == wanted)
@@ -173,9 +162,13 @@ async fn two_robots_merge_by_tls() {
     beta.stop().await.unwrap();
 }
 
+/// Held by the tests that hear or cause refusals: those of all tests of one process are heard together.
+static REFUSALS: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
+
 /// Who has no certificate of this swarm's authority that is good now gets no link, and the reason is kept to be told.
 #[tokio::test(flavor = "multi_thread")]
 async fn strangers_get_no_link_and_the_reason_is_told() {
+    let _alone = REFUSALS.lock().await;
     let refused = Arc::<Refusals>::default();
     tracing_subscriber::registry().with(refusals::layer(refused.clone())).init();
     let dir = tempfile::tempdir().unwrap();
@@ -341,6 +334,7 @@ async fn a_router_from_the_written_file_passes_on_what_each_says_in_its_own_name
 /// Whoever's certificate ends while linked is parted from.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_link_closes_when_a_certificate_ends() {
+    let _alone = REFUSALS.lock().await;
     let dir = tempfile::tempdir().unwrap();
     let mut configs = swarm(dir.path(), &["alpha", "beta"]);
     let authority = secured(dir.path(), &mut configs, &[], &[]);

@@ -23,7 +23,10 @@ pub struct CheckArgs {
 /// The first thing that is wrong.
 pub fn run(args: &CheckArgs) -> Result<bool> {
     let config = FileConfig::load(&args.config)?;
-    config.identity()?;
+    let robot = config.roster.get(&config.robot);
+    if robot.is_some() {
+        config.identity()?;
+    }
     let links = match Guard::of(&config)? {
         Some(guard) => {
             let certificate = &guard.credentials.certificate;
@@ -36,15 +39,12 @@ pub fn run(args: &CheckArgs) -> Result<bool> {
         None if config.zenoh.security.is_some() => "Links are plain: zenoh.security = \"none\".".into(),
         None => "Links are plain, and stay on this host.".into(),
     };
-    let id = config.roster.get(&config.robot).map(|key| RobotId::of_key(&key.to_bytes()).to_string());
-    say(&format!(
-        "# {}: good. Robot {} of swarm {}, id {}, one of {}.\n# {links}\n",
-        args.config.display(),
-        config.robot,
-        config.swarm,
-        id.unwrap_or_default(),
-        config.roster.len()
-    ))?;
+    let (file, own, swarm, robots) = (args.config.display(), &config.robot, &config.swarm, config.roster.len());
+    let who = match robot.map(|key| RobotId::of_key(&key.to_bytes())) {
+        Some(id) => format!("Robot {own} of swarm {swarm}, id {id}, one of {robots}"),
+        None => format!("Observer {own} of swarm {swarm}, of {robots} robots: for `merganser watch --config`"),
+    };
+    say(&format!("# {file}: good. {who}.\n# {links}\n"))?;
     say(toml::to_string(&config)?.trim_end())?;
     Ok(true)
 }

@@ -215,7 +215,7 @@ async fn tell_drops(drops: Arc<Drops>, refused: Arc<Refusals>) {
         tokio::time::sleep(DROPS_EVERY).await;
         for (refusal, count) in refused.take() {
             let others = "refused: links, for other reasons";
-            if (0..count).fold(false, |first, _| first | drops.count_named_first(refusal.to_string(), others)) {
+            if drops.count_named_times(refusal.to_string(), count, others) {
                 warn!(cure = refusal.cure(), "{refusal}; the next ones of this kind are only counted");
             }
         }

@@ -2,6 +2,7 @@
 //! travels as a line of JSON. It only listens and asks for views: it holds no key and changes nothing.
 
 use super::{BadInput, runtime, say};
+use crate::certificates::expiry;
 use crate::config::{FileConfig, LogConfig, LogFormat, ZenohConfig};
 use crate::keys;
 use crate::link::session::{self, Guard, Role};
@@ -73,10 +74,14 @@ fn secs(text: &str) -> Result<f64, String> {
 /// # Errors
 /// If Zenoh does not open or the output cannot be written.
 pub fn run(args: &WatchArgs) -> Result<bool> {
-    telemetry::init(&LogConfig { format: LogFormat::Text, filter: "warn,zenoh=error".into() });
+    let refused = telemetry::init(&LogConfig { format: LogFormat::Text, filter: "warn,zenoh=error".into() });
     let runtime = runtime()?;
     let seen = runtime.block_on(watch(args));
     runtime.shutdown_timeout(Duration::from_millis(200));
+    // Whoever sees nobody is told here why.
+    for (refusal, count) in refused.take() {
+        tracing::warn!(count, cure = refusal.cure(), "{refusal}");
+    }
     seen
 }
 
@@ -88,6 +93,9 @@ async fn watch(args: &WatchArgs) -> Result<bool> {
             "{robot} is a robot, and views go by TLS to observers alone: name an observer's configuration, or look on from \
              the robot itself by --no-multicast --connect tcp/127.0.0.1:7448"
         )));
+    }
+    if let Some(warning) = guard.as_ref().and_then(|guard| guard.credentials.certificate.warning(expiry::now())) {
+        tracing::warn!("{warning}");
     }
     let mut zenoh = config.as_ref().map_or_else(ZenohConfig::default, |config| config.zenoh.clone());
     zenoh.connect.extend(args.connect.iter().cloned());

@@ -63,9 +63,8 @@ pub enum Security {
 pub struct ZenohConfig {
     /// Peer unless the swarm is large.
     pub mode: Mode,
-    /// How links with other robots are protected. Absent: by TLS, unless they never leave this host
-    /// (no multicast, and all endpoints on the loopback) and none of
-    /// them is TLS.
+    /// How links with other robots are protected. Absent: by TLS, unless they never leave this host (no multicast, and
+    /// all endpoints on the loopback) and none of them is TLS.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub security: Option<Security>,
     /// This robot's certificate, with the key of `key_file`; relative to the configuration file's folder.

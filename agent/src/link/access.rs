@@ -56,8 +56,10 @@ pub fn by_name(swarm: &Name, members: &Members, relays: bool, feeding: Option<(&
     let everything = [format!("{}/{swarm}/**", keys::PREFIX)];
     let alive = all(&[keys::ALIVE.into()]);
 
-    // Input is never relayed: a robot would sign what another fed to it.
-    let published = all(&[&said[..], &views].concat());
+    // Whoever takes input over interfaces takes it by them alone: a robot would sign what another fed to it. Who takes
+    // none lets it in, to be counted and refused in words.
+    let astray = if feeding.is_none() { all(&["in/*".into()]) } else { Vec::new() };
+    let published = [all(&[&said[..], &views].concat()), astray.clone()].concat();
     let relay = vec![
         list.rule("relay", asking(), BOTH, &everything),
         list.rule("pass on", publications(), OUT, &everything),
@@ -70,7 +72,7 @@ pub fn by_name(swarm: &Name, members: &Members, relays: bool, feeding: Option<(&
     if relays && !members.robots.is_empty() {
         list.policy(named("all robots", robots), &relay);
     } else if !members.robots.is_empty() {
-        let rules = [
+        let mut rules = vec![
             list.rule("ask", json!(["query"]), BOTH, &all(&asked)),
             list.rule("pass on questions for views", json!(["query"]), OUT, &all(&views)),
             list.rule("listen", json!(["declare_subscriber"]), IN, &all(&said)),
@@ -80,6 +82,9 @@ pub fn by_name(swarm: &Name, members: &Members, relays: bool, feeding: Option<(&
             list.rule("declare", json!(["declare_subscriber", "declare_queryable"]), OUT, &everything),
             list.rule("show presence", json!(["liveliness_token"]), OUT, &alive),
         ];
+        if !astray.is_empty() {
+            rules.push(list.rule("send input astray", publications(), IN, &astray));
+        }
         list.policy(named("all robots", robots), &rules);
         for robot in &members.robots {
             let of = |rests: &[String]| rests.iter().map(|rest| keys::of(swarm, robot, rest)).collect::<Vec<_>>();
@@ -187,9 +192,10 @@ impl List {
 mod tests {
     use super::*;
 
-    /// Whoever relays passes on no input: a robot would sign what another fed to it. The own doors take it all the same.
+    /// A robot would sign what another fed to it, also through one that relays. Where input is taken over interfaces, it
+    /// comes in by them alone; where none is, it comes in to be refused in words.
     #[test]
-    fn input_is_relayed_by_nobody() {
+    fn input_comes_by_the_own_interfaces_alone_or_is_refused_in_words() {
         let name = |text: &str| Name::new(text).unwrap();
         let members = Members {
             robots: [name("alpha"), name("beta")].into(),
@@ -198,8 +204,6 @@ mod tests {
         };
         let doors = ["lo".to_owned()];
         for relays in [false, true] {
-            let list = by_name(&name("field"), &members, relays, Some((&name("alpha"), &doors)));
-            let rules = list["rules"].as_array().unwrap();
             let feeds = |rule: &&Value| {
                 let has = |field: &str, what: &str| rule[field].as_array().unwrap().iter().any(|x| x == what);
                 let covers = |key: &Value| {
@@ -210,8 +214,14 @@ mod tests {
                     && has("flows", "ingress")
                     && rule["key_exprs"].as_array().unwrap().iter().any(covers)
             };
-            let feeding: Vec<&Value> = rules.iter().filter(feeds).map(|rule| &rule["id"]).collect();
-            assert_eq!(feeding, ["feed"], "relays: {relays}");
+            let by = |feeding: Option<(&Name, &[String])>| -> Vec<Value> {
+                let list = by_name(&name("field"), &members, relays, feeding);
+                list["rules"].as_array().unwrap().iter().filter(feeds).map(|rule| rule["id"].clone()).collect()
+            };
+            assert_eq!(by(Some((&name("alpha"), &doors))), ["feed"], "relays: {relays}");
+            let told =
+                if relays { vec!["relay publications"] } else { vec!["relay publications", "send input astray"] };
+            assert_eq!(by(None), told);
         }
     }
 }

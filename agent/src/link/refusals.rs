@@ -77,7 +77,8 @@ impl Refusal {
         } else if has("no certificates") || has("CertificateRequired") {
             "somebody without a certificate called; robots get theirs by `merganser keys certificate`"
         } else if has("corrupt message") || has("eof") {
-            "somebody called who does not speak TLS, or hung up; without zenoh.security = \"none\" there is no plain TCP"
+            "somebody called who does not speak TLS, or hung up: without zenoh.security = \"none\" there is no plain TCP, \
+             and the robot's own SLAM connects to zenoh.input_listen (`view/status`: input)"
         } else if has("open files") {
             "let the agent have more files open: LimitNOFILE in its unit"
         } else {

@@ -5,12 +5,14 @@
 use merganser::certificates::Holder;
 use merganser::certificates::authority::Authority;
 use merganser::config::{FileConfig, Security};
+use merganser::driver::Clock;
 use merganser::host::{Host, Options};
+use merganser::store;
 use merganser::trust::SecretKey;
 use merganser_protocol::agent::io::{Input, Output};
 use merganser_protocol::agent::{Agent, Core};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3, So3};
-use merganser_protocol::ids::{Hash, Name};
+use merganser_protocol::ids::{Hash, Name, RobotId};
 use merganser_protocol::snapshot::Snapshot;
 use merganser_protocol::submap::{CovarianceOf, Keyframe};
 use merganser_protocol::time::{Instant, Stamp};
@@ -81,6 +83,17 @@ pub fn secured(folder: &Path, configs: &mut [FileConfig], observers: &[&str], ro
 pub fn free_endpoint() -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     format!("tcp/127.0.0.1:{}", listener.local_addr().unwrap().port())
+}
+
+/// An agent of which `core` is the core: it says what it is told to, and keeps what it hears.
+pub async fn puppet(config: &FileConfig, core: &Puppet) -> Host {
+    let store = store::open(config).unwrap().store;
+    Host::assemble(config, core.clone(), store, None, Clock::start()).await.unwrap()
+}
+
+/// The robot of a configuration.
+pub fn id(config: &FileConfig) -> RobotId {
+    RobotId::of_key(&config.roster[&config.robot].to_bytes())
 }
 
 pub async fn start(config: &FileConfig, journal: Option<&Path>) -> Host {
