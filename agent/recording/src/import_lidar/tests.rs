@@ -179,6 +179,12 @@ fn a_thinned_sequence_has_times_that_an_agent_takes() {
         fs::write(d.join("poses.txt"), rows(&thin)).unwrap();
     });
     assert!(text.contains("scan 000006 has no pose") && text.contains("index x y z"), "{text}");
+    // As many poses as scans, and another's among them: small whole numbers count scans, and no seconds.
+    let (_, _, text) = bad(|d| {
+        bins(d, 3);
+        fs::write(d.join("poses.txt"), table(&thin, |k| k.to_string())).unwrap();
+    });
+    assert!(text.contains("has no pose"), "{text}");
 }
 
 /// A PCD as FAST-LIO writes its points.
