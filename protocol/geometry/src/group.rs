@@ -1,11 +1,12 @@
-//! What SE(3) and SIM(3) share, so that residuals, factors and consensus are written once for both. Tangent order and
+//! What SE(2), SE(3) and SIM(3) share, so that residuals, factors and consensus are written once for all. Tangent order and
 //! perturbations as everywhere (MATH §1).
 
-use super::{Se3, Sim3, se3, sim3};
+use super::{Se2, Se3, Sim3, se2, se3, sim3};
 use core::fmt::Debug;
 use nalgebra::{Matrix6, SMatrix, SVector};
 
-/// A matrix Lie group of dimension `N` that contains the rigid motions.
+/// A matrix Lie group of dimension `N`: the rigid motions of space, the similarities that contain them, or the motions
+/// of the plane that they contain.
 pub trait Group<const N: usize>: Copy + Debug + PartialEq + core::ops::Mul<Output = Self> {
     /// The identity.
     fn identity() -> Self;
@@ -24,10 +25,10 @@ pub trait Group<const N: usize>: Copy + Debug + PartialEq + core::ops::Mul<Outpu
     fn left_jacobian_inv(xi: &SVector<f64, N>) -> SMatrix<f64, N, N>;
     /// ad(ξ).
     fn ad(xi: &SVector<f64, N>) -> SMatrix<f64, N, N>;
-    /// A rigid motion as an element of the group.
+    /// A rigid motion as an element of the group; in SE(2), what it does in the plane.
     fn embed(t: &Se3) -> Self;
     /// A covariance of a rigid motion's perturbation as one in the group: no log-scale variance, hence only
-    /// semidefinite in SIM(3).
+    /// semidefinite in SIM(3); the marginal in SE(2).
     fn embed_covariance(sigma: &Matrix6<f64>) -> SMatrix<f64, N, N>;
 
     /// Exact J_r(ξ) = J_l(−ξ).
@@ -89,6 +90,7 @@ macro_rules! group {
     };
 }
 
+group!(Se2, se2, 3, Se2::of, se2::in_plane);
 group!(Se3, se3, 6, |t: &Se3| *t, |sigma: &Matrix6<f64>| *sigma);
 group!(Sim3, sim3, 7, Sim3::from_se3, |sigma: &Matrix6<f64>| {
     let mut m = sim3::Matrix7::zeros();

@@ -7,7 +7,7 @@
 //!
 //! ```text
 //!  So3 ─► Se3 ─► Sim3          one Group each: exp, log, adjoint, left and right Jacobians
-//!          │      │
+//!    Se2 ┘│      │            the motions of the plane in those of space
 //!  PoseWithCovariance, SimWithCovariance ─► Relative: either, between two frames
 //! ```
 //!
@@ -34,6 +34,7 @@ pub mod group;
 mod laws;
 pub mod relative;
 pub mod sampling;
+pub mod se2;
 pub mod se3;
 pub mod sim3;
 pub mod so3;
@@ -42,6 +43,7 @@ pub mod split_ci;
 pub use gaussian::{Covariance, CovarianceError, PoseWithCovariance, SimWithCovariance};
 pub use group::Group;
 pub use relative::{Disagreement, Relative};
+pub use se2::Se2;
 pub use se3::Se3;
 pub use sim3::Sim3;
 pub use so3::So3;
