@@ -23,6 +23,7 @@ mod gls;
 mod hypothesis;
 mod measured;
 mod pairs;
+mod planar;
 mod predict;
 mod promising;
 mod scaled;
@@ -148,17 +149,20 @@ impl Default for FrameConsensusConfig {
     }
 }
 
-/// Aligns two metric frames.
+/// Aligns two metric frames; those of planar robots in their three degrees of freedom, see [`planar`].
 pub fn align_frames(
     alpha: &Trajectory,
     beta: &Trajectory,
     alignments: &[PairAlignment],
     config: &FrameConsensusConfig,
 ) -> FrameOutcome {
+    if let Some(outcome) = planar::align(alpha, beta, alignments, config) {
+        return outcome;
+    }
     let rigid = alignments.iter().map(|a| (a.i, a.j, (a.t_i_j.pose, a.t_i_j.covariance, true)));
     Measured::<6, Se3>::new(alpha, beta, rigid, config)
         .outcome()
-        .map(|pose, covariance| PoseWithCovariance { pose, covariance })
+        .map(|_, pose, covariance| PoseWithCovariance { pose, covariance })
 }
 
 /// Aligns two frames of which at least one has unknown scale: `t_alpha_beta` is a similarity. Alignments measure scale
@@ -173,13 +177,14 @@ pub fn align_frames_sim<T: Copy + Into<SimMeasurement>>(
     let similar = alignments.iter().map(|a| (a.i, a.j, a.t_i_j.into().parts()));
     Measured::<7, Sim3>::new(alpha, beta, similar, config)
         .outcome()
-        .map(|sim, covariance| SimWithCovariance { sim, covariance })
+        .map(|_, sim, covariance| SimWithCovariance { sim, covariance })
 }
 
 impl<G, const N: usize> FrameOutcome<(G, Covariance<N>)> {
-    fn map<T>(self, f: impl Fn(G, Covariance<N>) -> T) -> FrameOutcome<T> {
+    /// `f` of the alignments used, T_αβ and its covariance.
+    fn map<T>(self, f: impl Fn(&[usize], G, Covariance<N>) -> T) -> FrameOutcome<T> {
         let map = |c: FrameConsensus<(G, Covariance<N>)>| FrameConsensus {
-            t_alpha_beta: f(c.t_alpha_beta.0, c.t_alpha_beta.1),
+            t_alpha_beta: f(&c.used, c.t_alpha_beta.0, c.t_alpha_beta.1),
             used: c.used,
             covariance_scale: c.covariance_scale,
             log10_nfa: c.log10_nfa,
@@ -197,5 +202,5 @@ impl<G, const N: usize> FrameOutcome<(G, Covariance<N>)> {
 
 /// Gate on d² of a pair at a covariance scale: two true alignments are seldom further apart.
 fn gate(dimension: usize, scale: f64) -> f64 {
-    chi2::P999[5 + usize::from(dimension == 7)] * scale * scale
+    chi2::P999[dimension.clamp(1, chi2::P999.len()) - 1] * scale * scale
 }

@@ -5,13 +5,10 @@ use merganser_protocol::estimate::frames::world::{Draw, SimWorld, World};
 use merganser_protocol::estimate::frames::{
     FrameConsensusConfig, FrameOutcome, PairAlignment, SimMeasurement, align_frames, align_frames_sim,
 };
-use merganser_protocol::geometry::{Covariance, PoseWithCovariance, SimWithCovariance};
+use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se2, SimWithCovariance, chi2, se2};
 use nalgebra::SVector;
 use std::fmt::Write;
 use std::ops::Range;
-
-/// χ² quantiles at 95 % for 6 and 7 degrees of freedom.
-const CHI2_95: [f64; 2] = [12.591_587_243_743_977, 14.067_140_449_340_169];
 
 /// What a cell is measured for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,11 +24,13 @@ pub enum Goal {
     Honest,
 }
 
-/// The unit of the second frame.
+/// The unit of the second frame, and where its robots move.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Unit {
     /// Metres.
     Metre,
+    /// Metres, in the plane.
+    MetreInPlane,
     /// Unknown; each alignment measures it.
     Measured,
     /// Unknown; only the baselines between alignments give it.
@@ -86,6 +85,7 @@ pub fn cells() -> Vec<Cell> {
     let cell = |name, draw, scale_max, goal| Cell { name, draw, scale_max, unit: Unit::Metre, goal };
     let under_reported = Draw { under_reported: 3.0, ..draw(4, 0, 16) };
     let similar = |name, draw, goal| Cell { name, draw, scale_max: 3.0, unit: Unit::Measured, goal };
+    let planar = |name, draw, goal| Cell { name, draw, scale_max: 3.0, unit: Unit::MetreInPlane, goal };
     let unscaled = |name, draw, goal| Cell { name, draw, scale_max: 3.0, unit: Unit::Unmeasured, goal };
     vec![
         cell("80 % false", draw(4, 0, 16), 1.0, Goal::Right(100.0)),
@@ -106,6 +106,16 @@ pub fn cells() -> Vec<Cell> {
         cell("10 true", draw(10, 0, 0), 1.0, Goal::Honest),
         cell("10 true", draw(10, 0, 0), 3.0, Goal::Honest),
         cell("10 true of 50", draw(10, 0, 40), 3.0, Goal::Honest),
+        planar("SE(2), 80 % false", draw(4, 0, 16), Goal::Right(99.0)),
+        planar("SE(2), 85 % false", draw(3, 0, 17), Goal::Right(70.0)),
+        planar("SE(2), 10 true v 5 of one lie", draw(10, 5, 5), Goal::Right(99.0)),
+        planar("SE(2), 4 true v 3 of one lie", draw(4, 3, 13), Goal::Right(95.0)),
+        planar("SE(2), 4 true v 4 of one lie", draw(4, 4, 12), Goal::Ambiguous(95.0)),
+        planar("SE(2), under-reported 3x", under_reported, Goal::Right(75.0)),
+        planar("SE(2), all 20 false", draw(0, 0, 20), Goal::Nothing),
+        planar("SE(2), all 60 false", draw(0, 0, 60), Goal::Nothing),
+        planar("SE(2), 10 true", draw(10, 0, 0), Goal::Honest),
+        planar("SE(2), 10 true of 50", draw(10, 0, 40), Goal::Honest),
         similar("SIM(3), 80 % false", draw(4, 0, 16), Goal::Right(99.0)),
         similar("SIM(3), 10 true", draw(10, 0, 0), Goal::Honest),
         unscaled("SIM(3) by baselines, 80 % false", draw(4, 0, 16), Goal::Right(99.0)),
@@ -120,12 +130,26 @@ pub fn measure(cell: &Cell, seeds: Range<u64>, mut done: impl FnMut()) -> Tally 
     let config = FrameConsensusConfig { covariance_scale_max: cell.scale_max, ..FrameConsensusConfig::default() };
     let mut tally = Tally::default();
     for seed in seeds {
-        let world = World::new(seed, cell.draw);
+        let world = match cell.unit {
+            Unit::MetreInPlane => World::planar(seed, cell.draw),
+            _ => World::new(seed, cell.draw),
+        };
         match cell.unit {
             Unit::Metre => {
                 let outcome = align_frames(&world.alpha, &world.beta, &world.alignments, &config);
                 let judge = |t: &PoseWithCovariance| (world.is_right(&t.pose), t.pose.local(&world.t_alpha_beta));
-                tally.add(&world, outcome, |t| &t.covariance, judge);
+                tally.add(&world, outcome, |t| t.covariance, judge);
+                let told = align_frames(&world.alpha, &world.beta, &true_ones(&world, &world.alignments), &config);
+                tally.add_told(&told, |t| world.is_right(&t.pose));
+            }
+            Unit::MetreInPlane => {
+                let outcome = align_frames(&world.alpha, &world.beta, &world.alignments, &config);
+                let flat = |t: &PoseWithCovariance| Covariance::new_or_wider(se2::in_plane(t.covariance.matrix()));
+                let judge = |t: &PoseWithCovariance| {
+                    let error = Se2::of(&t.pose).local(&Se2::of(&world.t_alpha_beta));
+                    (world.is_right(&t.pose), error)
+                };
+                tally.add(&world, outcome, flat, judge);
                 let told = align_frames(&world.alpha, &world.beta, &true_ones(&world, &world.alignments), &config);
                 tally.add_told(&told, |t| world.is_right(&t.pose));
             }
@@ -150,7 +174,7 @@ impl Tally {
     ) {
         let outcome = align_frames_sim(&sim.alpha, &sim.beta, &sim.alignments, config);
         let judge = |t: &SimWithCovariance| (sim.is_right(&t.sim), t.sim.local(&sim.t_alpha_beta));
-        self.add(world, outcome, |t| &t.covariance, judge);
+        self.add(world, outcome, |t| t.covariance, judge);
         let told = align_frames_sim(&sim.alpha, &sim.beta, &true_ones(world, &sim.alignments), config);
         self.add_told(&told, |t| sim.is_right(&t.sim));
     }
@@ -165,7 +189,7 @@ impl Tally {
         &mut self,
         world: &World,
         outcome: FrameOutcome<T>,
-        covariance: impl Fn(&T) -> &Covariance<N>,
+        covariance: impl Fn(&T) -> Covariance<N>,
         judge: impl Fn(&T) -> (bool, SVector<f64, N>),
     ) {
         self.worlds += 1;
@@ -181,7 +205,7 @@ impl Tally {
                 } += 1;
                 self.with_false += u32::from(with_false);
                 self.distance_squared += distance_squared * 6.0 / N as f64;
-                self.inside += u32::from(distance_squared < CHI2_95[N - 6]);
+                self.inside += u32::from(distance_squared < chi2::P95[N - 1]);
             }
             FrameOutcome::Provisional(c) => {
                 let (right, _) = judge(&c.t_alpha_beta);

@@ -8,6 +8,7 @@
 //! that speak of different transforms.
 
 use super::clique::{self, Set, bit};
+use super::gate;
 use super::gls::{Gls, LeftOut};
 use super::hypothesis;
 use super::measured::{Measured, SCALES, scales_to};
@@ -20,11 +21,16 @@ use std::collections::BTreeMap;
 /// Scales reach at least this far: the tails of what is propagated to first order are longer than Gaussian.
 const SCALE_MAX_LEAST: f64 = 2.0;
 
+/// An alignment is tried for a set if it agrees with a member at this many times the widest gate.
+const NEAR: f64 = 2.0;
+
 /// Evidence of sets, each solved once.
 pub(super) struct Evidence<'a, const N: usize, G> {
     measured: &'a Measured<'a, N, G>,
     pairs: &'a Pairs,
     scales: [f64; SCALES],
+    /// Those with which each alignment agrees by a wide gate.
+    near: Vec<Set>,
     known: BTreeMap<Set, Known>,
 }
 
@@ -40,6 +46,7 @@ impl<'a, const N: usize, G: Scaled<N>> Evidence<'a, N, G> {
             measured,
             pairs,
             scales: scales_to(measured.config.covariance_scale_max.max(SCALE_MAX_LEAST)),
+            near: pairs.graph(gate(N, NEAR * measured.scales().into_iter().fold(1.0, f64::max))),
             known: BTreeMap::new(),
         }
     }
@@ -54,6 +61,17 @@ impl<'a, const N: usize, G: Scaled<N>> Evidence<'a, N, G> {
         let k = (set & (bit(l) - 1)).count_ones() as usize;
         let known = self.known(set);
         known.evidence - known.without.get(k).copied().unwrap_or(0.0)
+    }
+
+    /// What alignment `l` adds or would add to `set`; −∞ where it is far from all of its members.
+    pub(super) fn gain(&mut self, set: Set, l: usize) -> f64 {
+        if set & bit(l) != 0 {
+            self.of_member(set, l)
+        } else if set.count_ones() >= 2 && self.near[l] & set != 0 {
+            self.of(set | bit(l)) - self.of(set)
+        } else {
+            f64::NEG_INFINITY
+        }
     }
 
     fn known(&mut self, set: Set) -> &Known {

@@ -28,7 +28,7 @@ pub(super) struct Measured<'a, const N: usize, G> {
     pub(super) beta: &'a Trajectory,
     pub(super) alignments: Vec<Alignment<N, G>>,
     pub(super) config: &'a FrameConsensusConfig,
-    /// Volumes of the boxes around either trajectory, each in its own unit.
+    /// Volumes of the boxes around either trajectory, areas in the plane, each in its own unit.
     boxes: [f64; 2],
 }
 
@@ -65,7 +65,10 @@ impl<'a, const N: usize, G: Scaled<N>> Measured<'a, N, G> {
         let kept = n.min(ALIGNMENTS_MAX);
         let mut taken = (0..kept).map(|k| k * n / kept).peekable();
         let thinned = keyed.into_iter().enumerate().filter(|(k, _)| taken.next_if_eq(k).is_some());
-        let volume = |t: &Trajectory| t.extent().map(|edge| edge.max(config.search_edge_min)).product();
+        let volume = |t: &Trajectory| {
+            let edges = t.extent().map(|edge| edge.max(config.search_edge_min));
+            if N == 3 { edges.xy().product() } else { edges.product() }
+        };
         let boxes = [volume(alpha), volume(beta)];
         Self { alpha, beta, alignments: thinned.map(|(_, (_, a))| a).collect(), config, boxes }
     }
@@ -81,6 +84,7 @@ impl<'a, const N: usize, G: Scaled<N>> Measured<'a, N, G> {
     pub(super) fn search_volume(&self, scale: f64) -> f64 {
         let [alpha, beta] = self.boxes;
         let rotations = match self.config.rotations {
+            _ if N == 3 => 2.0 * PI,
             Rotations::Heading => 2.0 * PI * 0.4 * 0.4,
             Rotations::All => 8.0 * PI * PI,
         };

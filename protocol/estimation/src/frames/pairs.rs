@@ -120,7 +120,7 @@ fn distance<const N: usize, G: Scaled<N>>(
     (if d2.is_nan() { f64::INFINITY } else { d2 }, log_sqrt_det)
 }
 
-/// ln of the volume of the unit ball: π³/6 in six dimensions, 16π³/105 in seven.
+/// ln of the volume of the unit ball: 4π/3 in three dimensions, π³/6 in six, 16π³/105 in seven.
 fn log_ball_volume(dimension: usize) -> f64 {
     let half = 0.5 * dimension as f64;
     half * log(PI) - lgamma(half + 1.0)

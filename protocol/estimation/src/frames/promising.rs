@@ -4,6 +4,8 @@
 use super::clique::{self, Set, bit};
 use super::measured::Measured;
 use super::pairs::Pairs;
+use super::planar;
+use super::scaled::Scaled;
 use super::{FrameConsensusConfig, PairAlignment, gate};
 use crate::geometry::Se3;
 use crate::trajectory::Trajectory;
@@ -21,10 +23,16 @@ pub(crate) fn promising(
     config: &FrameConsensusConfig,
     most: usize,
 ) -> Vec<usize> {
+    if planar::is_planar(alpha, beta, alignments) {
+        return of(&planar::measured(alpha, beta, alignments, config), most);
+    }
     let rigid = alignments.iter().map(|a| (a.i, a.j, (a.t_i_j.pose, a.t_i_j.covariance, true)));
-    let measured = Measured::<6, Se3>::new(alpha, beta, rigid, config);
+    of(&Measured::<6, Se3>::new(alpha, beta, rigid, config), most)
+}
+
+fn of<const N: usize, G: Scaled<N>>(measured: &Measured<'_, N, G>, most: usize) -> Vec<usize> {
     let widest = measured.scales().into_iter().fold(1.0, f64::max);
-    let graph = Pairs::new(&measured).graph(gate(6, widest));
+    let graph = Pairs::new(measured).graph(gate(N, widest));
     let mut rest: Set = (0..measured.alignments.len()).map(bit).sum();
     let mut grouped = Vec::new();
     for _ in 0..GROUPS_MAX {

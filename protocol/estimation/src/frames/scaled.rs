@@ -5,7 +5,7 @@
 //! chance leaves it, taken at the scale under which it is tested.
 
 use super::measured::Alignment;
-use crate::geometry::{Covariance, Group, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3};
+use crate::geometry::{Covariance, Group, PoseWithCovariance, Se2, Se3, Sim3, SimWithCovariance, So3};
 use libm::{exp, sqrt};
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 
@@ -76,6 +76,21 @@ impl Scaled<6> for Se3 {
     }
     fn rotation(&self) -> So3 {
         self.rotation
+    }
+}
+
+impl Scaled<3> for Se2 {
+    fn scale(&self) -> f64 {
+        1.0
+    }
+    fn with_scale(&self, _: f64) -> Self {
+        *self
+    }
+    fn translation(&self) -> Vector3<f64> {
+        self.in_space().translation
+    }
+    fn rotation(&self) -> So3 {
+        self.in_space().rotation
     }
 }
 

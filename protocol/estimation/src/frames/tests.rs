@@ -2,7 +2,9 @@
 
 use super::world::{Draw, World};
 use super::*;
+use crate::geometry::Se2;
 use crate::geometry::sampling::{normals, rng};
+use crate::geometry::se2::in_plane;
 use nalgebra::Vector6;
 use rand::seq::SliceRandom;
 
@@ -28,10 +30,16 @@ fn config(covariance_scale_max: f64) -> FrameConsensusConfig {
 }
 
 fn tally(draw: Draw, config: &FrameConsensusConfig) -> Tally {
+    tally_of(World::new, align_frames, draw, config)
+}
+
+type Align = fn(&Trajectory, &Trajectory, &[PairAlignment], &FrameConsensusConfig) -> FrameOutcome;
+
+fn tally_of(world: fn(u64, Draw) -> World, align: Align, draw: Draw, config: &FrameConsensusConfig) -> Tally {
     let mut tally = Tally::default();
     for seed in 0..SEEDS {
-        let w = World::new(7000 + seed, draw);
-        match align_frames(&w.alpha, &w.beta, &w.alignments, config) {
+        let w = world(7000 + seed, draw);
+        match align(&w.alpha, &w.beta, &w.alignments, config) {
             FrameOutcome::Merged(c) if w.is_right(&c.t_alpha_beta.pose) => tally.right += 1,
             FrameOutcome::Merged(c) if c.used.iter().all(|&k| w.real[k]) => tally.weak += 1,
             FrameOutcome::Merged(_) => tally.wrong += 1,
@@ -148,6 +156,40 @@ fn a_doubtful_member_leaves_the_others_to_merge_alone() {
     assert!(dropped >= 15, "{dropped} dropped, {kept} kept");
 }
 
+/// As [`align_frames`], in six degrees of freedom wherever the robots move.
+fn in_space(
+    alpha: &Trajectory,
+    beta: &Trajectory,
+    alignments: &[PairAlignment],
+    config: &FrameConsensusConfig,
+) -> FrameOutcome {
+    let rigid = alignments.iter().map(|a| (a.i, a.j, (a.t_i_j.pose, a.t_i_j.covariance, true)));
+    Measured::<6, Se3>::new(alpha, beta, rigid, config)
+        .outcome()
+        .map(|_, pose, covariance| PoseWithCovariance { pose, covariance })
+}
+
+#[test]
+fn planar_frames_are_decided_in_the_plane() {
+    for (d, right, ambiguous) in [
+        (draw(4, 0, 16), 98, 0),
+        (draw(3, 0, 17), 70, 0),
+        (draw(10, 5, 5), 99, 0),
+        (draw(4, 3, 13), 97, 0),
+        (draw(4, 4, 12), 0, 98),
+        (Draw { under_reported: 3.0, ..draw(4, 0, 16) }, 75, 0),
+        (draw(0, 0, 20), 0, 0),
+        (draw(0, 0, 60), 0, 0),
+    ] {
+        let plane = tally_of(World::planar, align_frames, d, &config(3.0));
+        let space = tally_of(World::planar, in_space, d, &config(3.0));
+        println!("{d:?}\n  plane {plane:?}\n  space {space:?}");
+        assert!(plane.right >= right && plane.ambiguous >= ambiguous && plane.wrong == 0, "{plane:?}");
+        // Six degrees of freedom do worse: what they add is not measured.
+        assert!(plane.right + 2 >= space.right && plane.ambiguous + 2 >= space.ambiguous, "{plane:?} {space:?}");
+    }
+}
+
 #[test]
 fn two_alignments_are_shown_and_three_are_used() {
     let w = World::new(1, draw(3, 0, 0));
@@ -180,6 +222,49 @@ fn the_covariance_is_honest() {
     println!("ANEES {anees:.3}, {:.1} % inside the 95 % ellipsoid", 100.0 * inside);
     assert!((5.6 * 0.95..6.4 * 1.1).contains(&anees), "ANEES {anees}");
     assert!((0.92..0.98).contains(&inside), "{inside} inside the 95 % ellipsoid");
+}
+
+#[test]
+fn the_covariance_of_planar_frames_is_honest_in_the_plane() {
+    let (runs, mut sum, mut inside) = (300, 0.0, 0);
+    for seed in 0..runs {
+        let w = World::planar(20_000 + seed, draw(10, 0, 0));
+        let outcome = align_frames(&w.alpha, &w.beta, &w.alignments, &config(3.0));
+        let FrameOutcome::Merged(c) = outcome else { panic!("seed {seed}: {outcome:?}") };
+        let error = Se2::of(&c.t_alpha_beta.pose).local(&Se2::of(&w.t_alpha_beta));
+        let nees = Covariance::new(in_plane(c.t_alpha_beta.covariance.matrix())).unwrap().mahalanobis_squared(&error);
+        (sum, inside) = (sum + nees, inside + u32::from(nees < 7.815));
+        // Height and tilts are no better known than one alignment has them.
+        let sigmas = c.t_alpha_beta.covariance.sigmas();
+        assert!(sigmas[2] > 0.39 && sigmas[3].max(sigmas[4]) > 0.079, "{sigmas}");
+    }
+    let (anees, inside) = (sum / runs as f64, f64::from(inside) / runs as f64);
+    println!("ANEES {anees:.3} of 3, {:.1} % inside the 95 % ellipsoid", 100.0 * inside);
+    assert!((2.8 * 0.95..3.2 * 1.1).contains(&anees), "ANEES {anees} of 3");
+    assert!((0.92..0.98).contains(&inside), "{inside} inside the 95 % ellipsoid");
+}
+
+#[test]
+fn what_leaves_the_plane_is_decided_in_space() {
+    let flat = World::planar(3, draw(4, 0, 4));
+    let planar = |w: &World| planar::is_planar(&w.alpha, &w.beta, &w.alignments);
+    assert!(planar(&flat) && !planar(&World::new(3, draw(4, 0, 4))));
+    for nudge in [Vector6::z() * 1e-3, Vector6::new(0.0, 0.0, 0.0, 1e-3, 0.0, 0.0)] {
+        let mut w = flat.clone();
+        w.alignments[2].t_i_j.pose = w.alignments[2].t_i_j.pose.retract(&nudge);
+        assert!(!planar(&w), "{nudge}");
+    }
+    let mut w = flat.clone();
+    let mut tied = *w.alignments[2].t_i_j.covariance.matrix();
+    (tied[(0, 2)], tied[(2, 0)]) = (0.01, 0.01);
+    w.alignments[2].t_i_j.covariance = Covariance::new(tied).unwrap();
+    assert!(!planar(&w));
+    let mut w = flat;
+    w.beta.push(PoseWithCovariance {
+        pose: Se3::exp(&Vector6::new(1.0, 0.0, 0.1, 0.0, 0.0, 0.0)),
+        covariance: Covariance::from_sigmas([0.1; 6]).unwrap(),
+    });
+    assert!(!planar(&w));
 }
 
 #[test]
@@ -356,8 +441,9 @@ fn one_alignment_that_measures_scale_serves_those_that_do_not() {
 }
 
 /// Two robots wander about a room of 4 m; of `n` alignments, as vague as those of a few landmarks, and half as far off
-/// as they say, the first `truths` are true. How many of 50 worlds merge, and how many of these wrongly.
-fn vague(n: usize, truths: usize) -> (u32, u32) {
+/// as they say, the first `truths` are true; every third is `wider` times as vague. How many of 50 worlds merge, and how
+/// many of these wrongly.
+fn vague(n: usize, truths: usize, wider: f64) -> (u32, u32) {
     let planar = |x: f64, y: f64, turn: f64| Vector6::new(x, y, 0.0, 0.0, 0.0, turn);
     let stated = |sigmas: [f64; 6]| Covariance::from_sigmas(sigmas).unwrap();
     let [of_step, of_alignment] =
@@ -388,8 +474,11 @@ fn vague(n: usize, truths: usize) -> (u32, u32) {
             .map(|k| {
                 let (i, j) = (k % 6, (k + k / 6) % 6);
                 let truth = alpha[i].inverse() * beta[j];
-                let pose = k.checked_sub(truths).map_or_else(|| noisy(truth, 0.1, 0.05), |lie| lies[lie]);
-                PairAlignment { i, j, t_i_j: PoseWithCovariance { pose, covariance: of_alignment } }
+                let wider = if k % 3 == 2 { wider } else { 1.0 };
+                let noisy = || noisy(truth, 0.1 * wider, 0.05 * wider);
+                let pose = k.checked_sub(truths).map_or_else(noisy, |lie| lies[lie]);
+                let covariance = of_alignment.scaled(wider * wider);
+                PairAlignment { i, j, t_i_j: PoseWithCovariance { pose, covariance } }
             })
             .collect();
         if let FrameOutcome::Merged(c) = align_frames(&walks[0], &walks[1], &alignments, &config(3.0)) {
@@ -403,7 +492,14 @@ fn vague(n: usize, truths: usize) -> (u32, u32) {
 
 #[test]
 fn vague_alignments_merge_together_where_nothing_contradicts() {
-    let (all, half) = (vague(12, 12), vague(12, 6));
+    let (all, half) = (vague(12, 12, 1.0), vague(12, 6, 1.0));
     println!("merged, wrongly: {all:?} of 50 where all are true, {half:?} where half are");
     assert!(all.0 >= 47 && all.1 == 0 && half.1 == 0, "{all:?} {half:?}");
+}
+
+#[test]
+fn those_too_vague_to_say_anything_do_not_speak_against_the_others() {
+    let (without, with) = (vague(12, 12, 1.0), vague(12, 12, 4.0));
+    println!("merged, wrongly: {with:?} of 50 where four are four times as vague, {without:?} where they are not");
+    assert!(with.0 >= 40 && with.1 == 0, "{with:?}");
 }

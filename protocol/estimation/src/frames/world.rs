@@ -3,7 +3,7 @@
 //! other (perceptual aliasing). The world of MATH §5's table; nothing in the agent uses it.
 
 use super::PairAlignment;
-use crate::geometry::{Covariance, PoseWithCovariance, Se3, Sim3, SimWithCovariance, So3, se3};
+use crate::geometry::{Covariance, PoseWithCovariance, Se2, Se3, Sim3, SimWithCovariance, So3, se3};
 use crate::trajectory::Trajectory;
 use core::f64::consts::PI;
 use libm::{cos, exp, log, sin};
@@ -51,11 +51,21 @@ pub struct World {
 impl World {
     /// The world of a seed.
     pub fn new(seed: u64, draw: Draw) -> Self {
+        Self::drawn(seed, draw, &Kind::SPATIAL)
+    }
+
+    /// As [`Self::new`], of robots that drive on one floor and measure in its plane: what they know of the rest is a
+    /// gauge, as `merganser_registration` states it.
+    pub fn planar(seed: u64, draw: Draw) -> Self {
+        Self::drawn(seed, draw, &Kind::PLANAR)
+    }
+
+    fn drawn(seed: u64, draw: Draw, kind: &Kind) -> Self {
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let (start_a, start_b) = (uniform(rng, 0.0, 2.0 * PI), uniform(rng, 0.0, 2.0 * PI));
-        let at = |start: f64, k: usize| circuit(start + 2.0 * PI * k as f64 / ANCHORS as f64);
+        let at = |start: f64, k: usize| kind.pose(&circuit(start + 2.0 * PI * k as f64 / ANCHORS as f64));
         let true_a: Vec<Se3> = (0..ANCHORS).map(|k| at(start_a, k)).collect();
-        let true_b: Vec<Se3> = (0..ANCHORS).map(|k| at(start_b, k).retract(&scaled(rng, [0.3, 0.05]))).collect();
+        let true_b: Vec<Se3> = (0..ANCHORS).map(|k| at(start_b, k).retract(&kind.scaled(rng, [0.3, 0.05]))).collect();
         let mut near: Vec<(usize, usize)> = (0..ANCHORS)
             .flat_map(|i| (0..ANCHORS).map(move |j| (i, j)))
             .filter(|&(i, j)| (true_a[i].translation - true_b[j].translation).norm() < 3.0)
@@ -63,27 +73,32 @@ impl World {
         near.shuffle(rng);
         let mut found: Vec<(usize, usize, Se3, bool)> = Vec::new();
         for &(i, j) in near.iter().take(draw.real) {
-            let noise = scaled(rng, ALIGNMENT_SIGMAS) * draw.under_reported;
+            let noise = kind.scaled(rng, ALIGNMENT_SIGMAS) * draw.under_reported;
             found.push((i, j, (true_a[i].inverse() * true_b[j]).retract(&noise), true));
         }
         let mut shift: Vector3<f64> = normals(rng);
-        shift.z *= 0.1;
+        shift.z *= 0.1 * kind.rises;
         let displaced = Se3::new(So3::identity(), shift * (5.0 / shift.norm()));
         for _ in 0..draw.aliased {
             let (i, j) = near[rng.random_range(0..near.len())];
-            let t_i_j = (true_a[i].inverse() * displaced * true_b[j]).retract(&scaled(rng, ALIGNMENT_SIGMAS));
+            let t_i_j = (true_a[i].inverse() * displaced * true_b[j]).retract(&kind.scaled(rng, ALIGNMENT_SIGMAS));
             found.push((i, j, t_i_j, false));
         }
         for _ in 0..draw.random {
-            found.push((rng.random_range(0..ANCHORS), rng.random_range(0..ANCHORS), false_alignment(rng), false));
+            found.push((
+                rng.random_range(0..ANCHORS),
+                rng.random_range(0..ANCHORS),
+                kind.pose(&false_alignment(rng)),
+                false,
+            ));
         }
         found.shuffle(rng);
-        let covariance = covariance(ALIGNMENT_SIGMAS);
+        let covariance = kind.covariance(ALIGNMENT_SIGMAS, kind.aligned);
         let t_alpha_beta = true_a[0].inverse() * true_b[0];
         let centre = true_b.iter().map(|t| (true_b[0].inverse() * *t).translation).sum::<Vector3<f64>>();
         Self {
-            alpha: odometry(rng, &true_a),
-            beta: odometry(rng, &true_b),
+            alpha: odometry(rng, &true_a, kind),
+            beta: odometry(rng, &true_b, kind),
             real: found.iter().map(|f| f.3).collect(),
             alignments: found
                 .into_iter()
@@ -176,6 +191,35 @@ impl World {
     }
 }
 
+/// How its robots move and measure.
+struct Kind {
+    /// 1 in space, 0 in the plane: what is left of heights and tilts.
+    rises: f64,
+    /// Standard deviations of height (m) and tilts (rad) that an alignment states in the plane.
+    aligned: [f64; 2],
+    /// The same of an odometry step.
+    driven: [f64; 2],
+}
+
+impl Kind {
+    const SPATIAL: Self = Self { rises: 1.0, aligned: ALIGNMENT_SIGMAS, driven: ODOMETRY_SIGMAS };
+    const PLANAR: Self = Self { rises: 0.0, aligned: [0.4, 0.08], driven: [1e-3, 1e-4] };
+
+    fn pose(&self, t: &Se3) -> Se3 {
+        if self.rises > 0.0 { *t } else { Se2::of(t).in_space() }
+    }
+
+    fn scaled(&self, rng: &mut ChaCha8Rng, sigmas: [f64; 2]) -> Vector6<f64> {
+        let r = self.rises;
+        scaled(rng, sigmas).component_mul(&Vector6::new(1.0, 1.0, r, r, r, 1.0))
+    }
+
+    fn covariance(&self, [m, r]: [f64; 2], out_of_plane: [f64; 2]) -> Covariance<6> {
+        let [height, tilt] = if self.rises > 0.0 { [m, r] } else { out_of_plane };
+        covariance_of([m, m, height, tilt, tilt, r])
+    }
+}
+
 /// A point of the figure-eight, about 60 × 30 × 3 m, heading along the way.
 fn circuit(s: f64) -> Se3 {
     let point = |s: f64| Vector3::new(30.0 * sin(s), 15.0 * sin(2.0 * s), 1.5 * sin(3.0 * s));
@@ -184,13 +228,13 @@ fn circuit(s: f64) -> Se3 {
     Se3::new(So3::from_matrix(&Matrix3::from_columns(&[x, y, x.cross(&y)])), point(s))
 }
 
-fn odometry(rng: &mut ChaCha8Rng, truth: &[Se3]) -> Trajectory {
+fn odometry(rng: &mut ChaCha8Rng, truth: &[Se3], kind: &Kind) -> Trajectory {
     // A frame is its first anchor, exactly.
     let origin = PoseWithCovariance { pose: Se3::identity(), covariance: covariance([1e-8, 1e-8]) };
     let mut trajectory = Trajectory::new([origin]);
     for pair in truth.windows(2) {
-        let pose = (pair[0].inverse() * pair[1]).retract(&scaled(rng, ODOMETRY_SIGMAS));
-        trajectory.push(PoseWithCovariance { pose, covariance: covariance(ODOMETRY_SIGMAS) });
+        let pose = kind.pose(&(pair[0].inverse() * pair[1]).retract(&kind.scaled(rng, ODOMETRY_SIGMAS)));
+        trajectory.push(PoseWithCovariance { pose, covariance: kind.covariance(ODOMETRY_SIGMAS, kind.driven) });
     }
     trajectory
 }

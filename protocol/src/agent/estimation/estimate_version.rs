@@ -7,7 +7,7 @@ use crate::ids::Hash;
 
 /// Version of what the code makes of facts. It rises with every change that makes another map of equal facts: of a
 /// constant, of an order of sums, of what counts. `sim/fingerprints.txt` shows such a change.
-pub const ESTIMATE_VERSION: u32 = 2;
+pub const ESTIMATE_VERSION: u32 = 3;
 
 /// `{version}-{16 hexadecimal digits}`: the digits are of the options of `core.estimate` that change the map. How often
 /// a robot solves (`interval_secs`) does not.
