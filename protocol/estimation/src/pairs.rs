@@ -272,8 +272,8 @@ fn used(of: &[usize], edges: &[EdgeEstimate]) -> usize {
     of.iter().filter(|&&k| edges[k].is_used()).count()
 }
 
-/// Positions of at most [`WEIGHED_MAX`] of a pair's alignments: the most promising where units are equal, else evenly from first to
-/// last in canonical order.
+/// Positions of at most [`WEIGHED_MAX`] of a pair's alignments: the most promising where units are equal, else evenly
+/// from first to last in canonical order.
 fn weighed(
     admission: &Admission,
     (a, b): (FrameId, FrameId),

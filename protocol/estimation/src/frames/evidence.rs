@@ -68,7 +68,9 @@ impl<'a, const N: usize, G: Scaled<N>> Evidence<'a, N, G> {
         if set & bit(l) != 0 {
             self.of_member(set, l)
         } else if set.count_ones() >= 2 && self.near[l] & set != 0 {
-            self.of(set | bit(l)) - self.of(set)
+            // Infinite or no number where either set has no solution.
+            let gain = self.of(set | bit(l)) - self.of(set);
+            if gain.is_finite() { gain } else { f64::NEG_INFINITY }
         } else {
             f64::NEG_INFINITY
         }
