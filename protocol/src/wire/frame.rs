@@ -4,7 +4,6 @@
 
 use super::limits::{BEACON_LEN_MAX, HAVE_LEN_MAX, HEADER_LEN, MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX, SMALL_LEN_MAX};
 use super::pose::PoseError;
-use super::roster::StatementError;
 use crate::geometry::CovarianceError;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -42,17 +41,11 @@ pub enum FrameKind {
     LifeRequest = 11,
     /// A signed yes.
     LifeReply = 12,
-    /// Which signed roster is held.
-    RosterHead = 13,
-    /// "Give me your roster, if it counts and not this one."
-    RosterRequest = 14,
-    /// A signed roster.
-    RosterReply = 15,
 }
 
 impl FrameKind {
     /// Every kind, in order of its number.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 12] = [
         Self::Pose,
         Self::Facts,
         Self::Have,
@@ -65,9 +58,6 @@ impl FrameKind {
         Self::BlobSlice,
         Self::LifeRequest,
         Self::LifeReply,
-        Self::RosterHead,
-        Self::RosterRequest,
-        Self::RosterReply,
     ];
 
     fn of(number: u8) -> Option<Self> {
@@ -79,18 +69,10 @@ impl FrameKind {
         match self {
             Self::Pose | Self::LifeReply => BEACON_LEN_MAX,
             Self::Have => HAVE_LEN_MAX,
-            Self::BlobRequest
-            | Self::AlignRequest
-            | Self::AlignReply
-            | Self::LifeRequest
-            | Self::RosterHead
-            | Self::RosterRequest => SMALL_LEN_MAX,
-            Self::Facts
-            | Self::SyncRequest
-            | Self::SyncReply
-            | Self::BlobReply
-            | Self::BlobSlice
-            | Self::RosterReply => MESSAGE_LEN_MAX + MESSAGE_OVERHEAD_MAX,
+            Self::BlobRequest | Self::AlignRequest | Self::AlignReply | Self::LifeRequest => SMALL_LEN_MAX,
+            Self::Facts | Self::SyncRequest | Self::SyncReply | Self::BlobReply | Self::BlobSlice => {
+                MESSAGE_LEN_MAX + MESSAGE_OVERHEAD_MAX
+            }
         }
     }
 }
@@ -164,9 +146,6 @@ pub enum WireError {
         /// What it should be.
         mend: &'static str,
     },
-    /// A roster is none.
-    #[error(transparent)]
-    Roster(#[from] StatementError),
     /// A beacon's pose is no pose.
     #[error("pose beacon: {0}")]
     Pose(#[from] PoseError),
@@ -188,7 +167,6 @@ impl WireError {
             Self::Trailing { .. } => "trailing",
             Self::NonCanonical { .. } => "non_canonical",
             Self::Value { .. } => "value",
-            Self::Roster(error) => error.reason(),
             Self::Pose(_) => "pose",
             Self::Covariance(_) => "covariance",
         }
@@ -197,13 +175,8 @@ impl WireError {
 
 /// A frame of `kind` around `body`.
 pub(super) fn seal(kind: FrameKind, body: &impl Serialize) -> Vec<u8> {
-    seal_bytes(kind, &to_bytes(body))
-}
-
-/// The same around a body that is bytes already.
-pub(super) fn seal_bytes(kind: FrameKind, body: &[u8]) -> Vec<u8> {
     let mut bytes = vec![MAGIC[0], MAGIC[1], VERSION, kind as u8];
-    bytes.extend_from_slice(body);
+    bytes.extend_from_slice(&to_bytes(body));
     bytes
 }
 

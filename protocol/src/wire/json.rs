@@ -5,14 +5,12 @@ use super::entry::Entry;
 use super::fact::{Fact, VerdictOutcome};
 use super::have::{HaveVector, Head, Members};
 use super::life::{Life, Nonce};
-use super::roster::{Member, Roster, RosterContent};
 use crate::geometry::{PoseWithCovariance, Relative, Sim3};
 use crate::ids::{Hash, RobotId};
 use core::fmt::Display;
 use nalgebra::SMatrix;
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
 
 /// An id as text for people, as bytes on the wire.
 pub(super) fn id<S: Serializer, T: Display + Serialize>(id: &T, s: S) -> Result<S::Ok, S::Error> {
@@ -56,25 +54,6 @@ pub(super) fn life<S: Serializer>(life: &Life, s: S) -> Result<S::Ok, S::Error> 
     );
     let nonce = format!("{:032x}", u128::from_be_bytes(content.nonce));
     json!({ "robot": content.robot.to_string(), "nonce": nonce, "latest": latest }).serialize(s)
-}
-
-pub(super) fn roster<S: Serializer>(roster: &Roster, s: S) -> Result<S::Ok, S::Error> {
-    let RosterContent { swarm, version, members, observers, revoked } = roster.content();
-    let key = |key: &[u8; 32]| Hash(*key).to_string();
-    let member = |member: &Member| json!({ "key": key(&member.key), "old": member.old.as_ref().map(key) });
-    let members: BTreeMap<_, _> = members.iter().map(|(name, of)| (name, member(of))).collect();
-    let observers: BTreeMap<_, _> = observers.iter().map(|(name, of)| (name, key(of))).collect();
-    let revoked: Vec<Value> =
-        revoked.iter().map(|(of, why)| json!({ "key": key(of), "name": why.name, "kept": why.kept })).collect();
-    json!({
-        "swarm": swarm,
-        "swarm_key": key(roster.swarm_key()),
-        "version": version,
-        "members": members,
-        "observers": observers,
-        "revoked": revoked,
-    })
-    .serialize(s)
 }
 
 pub(super) fn have<S: Serializer>(have: &HaveVector, s: S) -> Result<S::Ok, S::Error> {

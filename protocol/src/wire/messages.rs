@@ -10,7 +10,6 @@ use super::life::{Life, Nonce};
 use super::limits::{
     self, BLOB_LEN_MAX, ENTRIES_PER_DELTA_MAX, ENTRY_LEN_MAX, FORKS_PER_DELTA_MAX, MESSAGE_LEN_MAX, PROOF_MAX,
 };
-use super::roster::{Roster, RosterHead};
 use crate::ids::{Hash, SubmapId};
 use serde::{Deserialize, Serialize};
 
@@ -78,12 +77,6 @@ pub enum Message {
     },
     /// A signed yes.
     LifeReply(#[serde(serialize_with = "super::json::life")] Life),
-    /// "This is the signed roster that I hold."
-    RosterHead(RosterHead),
-    /// "Give me the one that you hold, if it supersedes this."
-    RosterRequest(RosterHead),
-    /// A signed roster.
-    RosterReply(#[serde(serialize_with = "super::json::roster")] Box<Roster>),
 }
 
 /// Entries that a have-vector lacks.
@@ -166,8 +159,6 @@ impl Message {
             Self::AlignReply { status } => frame::seal(kind, status),
             Self::LifeRequest { nonce } => frame::seal(kind, nonce),
             Self::LifeReply(life) => frame::seal(kind, life),
-            Self::RosterHead(head) | Self::RosterRequest(head) => frame::seal(kind, head),
-            Self::RosterReply(roster) => frame::seal_bytes(kind, &roster.encode()),
         }
     }
 
@@ -220,9 +211,6 @@ impl Message {
             FrameKind::AlignReply => Self::AlignReply { status: frame::parse_body(kind, body)? },
             FrameKind::LifeRequest => Self::LifeRequest { nonce: frame::parse_body(kind, body)? },
             FrameKind::LifeReply => Self::LifeReply(frame::parse_body(kind, body)?),
-            FrameKind::RosterHead => Self::RosterHead(frame::parse_body(kind, body)?),
-            FrameKind::RosterRequest => Self::RosterRequest(frame::parse_body(kind, body)?),
-            FrameKind::RosterReply => Self::RosterReply(Box::new(Roster::decode(body)?)),
         })
     }
 
@@ -246,7 +234,7 @@ impl Message {
         messages
     }
 
-    /// A short name for byte counters: pose, facts, have, sync, blob, align, life or roster.
+    /// A short name for byte counters: pose, facts, have, sync, blob, align or life.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Pose(_) => "pose",
@@ -256,7 +244,6 @@ impl Message {
             Self::BlobRequest { .. } | Self::BlobReply { .. } => "blob",
             Self::AlignRequest { .. } | Self::AlignReply { .. } => "align",
             Self::LifeRequest { .. } | Self::LifeReply(_) => "life",
-            Self::RosterHead(_) | Self::RosterRequest(_) | Self::RosterReply(_) => "roster",
         }
     }
 
@@ -274,9 +261,6 @@ impl Message {
             Self::AlignReply { .. } => FrameKind::AlignReply,
             Self::LifeRequest { .. } => FrameKind::LifeRequest,
             Self::LifeReply(_) => FrameKind::LifeReply,
-            Self::RosterHead(_) => FrameKind::RosterHead,
-            Self::RosterRequest(_) => FrameKind::RosterRequest,
-            Self::RosterReply(_) => FrameKind::RosterReply,
         }
     }
 }

@@ -105,7 +105,7 @@ proptest! {
             .into_iter()
             .map(|(content, v)| Roster::sign(&swarm_key(), RosterContent { version: version(v), ..content }).unwrap())
             .collect();
-        fn heard<'a>(order: Vec<&'a Roster>) -> Option<&'a Roster> {
+        fn heard(order: Vec<&Roster>) -> Option<&Roster> {
             order.into_iter().reduce(|held, new| if new.supersedes(held) { new } else { held })
         }
         let mut shuffled: Vec<&Roster> = rosters.iter().chain(&rosters).collect();
@@ -150,7 +150,8 @@ fn forced(content: &RosterContent) -> Vec<u8> {
     use ed25519_dalek::Signer;
     let member = |(name, member): (&Name, &Member)| (name.clone(), member.key, member.old);
     let observers: Vec<(Name, Key)> = content.observers.iter().map(|(name, key)| (name.clone(), *key)).collect();
-    let revoked: Vec<(Key, Name, Vec<(u32, NonZero<u32>)>)> = content
+    type Raw = (Key, Name, Vec<(u32, NonZero<u32>)>);
+    let revoked: Vec<Raw> = content
         .revoked
         .iter()
         .map(|(key, of)| (*key, of.name.clone(), of.kept.iter().map(|(e, l)| (*e, *l)).collect()))
@@ -258,6 +259,20 @@ fn limits_of_rosters_are_checked_on_both_sides() {
     all.version = version(if all.version.get() == 128 { 1 << 14 } else { 128 });
     assert_eq!(Roster::sign(&swarm_key(), all.clone()), Err(StatementError::TooLong(ROSTER_LEN_MAX + 1)));
     assert_eq!(Roster::decode(&forced(&all)), Err(StatementError::TooLong(ROSTER_LEN_MAX + 1)));
+}
+
+/// Bytes that operators have in files: what was signed once is read by every later version.
+#[test]
+fn the_form_is_frozen() {
+    let golden: [(&[u8], RosterContent); 2] = [
+        (include_bytes!("../../golden/roster/all.bin"), content()),
+        (include_bytes!("../../golden/roster/first.bin"), RosterContent::first(swarm())),
+    ];
+    for (bytes, content) in golden {
+        let roster = Roster::sign(&swarm_key(), content).unwrap();
+        assert_eq!(roster.encode(), bytes, "the form has changed: it needs another number");
+        assert_eq!(Roster::decode(bytes), Ok(roster));
+    }
 }
 
 #[test]

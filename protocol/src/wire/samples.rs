@@ -202,14 +202,6 @@ samples! {
                 LifeContent { robot: robot(1), nonce: *b"drawn this time!", latest: None },
             )),
         }
-        Message::RosterHead(_) => { "roster_head" => Message::RosterHead(roster().head()) }
-        Message::RosterRequest(_) => { "roster_request" => Message::RosterRequest(roster().head()) }
-        Message::RosterReply(_) => {
-            "roster_reply" => Message::RosterReply(Box::new(roster())),
-            "roster_reply_first" => Message::RosterReply(Box::new(
-                Roster::sign(&roster_tests::swarm_key(), RosterContent::first(swarm())).unwrap(),
-            )),
-        }
     }
 }
 
@@ -240,11 +232,6 @@ pub fn life() -> Life {
     let latest = BeaconAge { epoch: 203_000_000, stamp: Stamp(1_700_000_000_123_456_789), counter: 1234 };
     let content = LifeContent { robot: robot(0), nonce: *b"drawn this time!", latest: Some(latest) };
     Life::sign(&key(0), SwarmTag::of(&swarm()), content)
-}
-
-/// With one of everything that a roster can say.
-pub fn roster() -> Roster {
-    Roster::sign(&roster_tests::swarm_key(), roster_tests::content()).unwrap()
 }
 
 /// A vector by the roster; `tag` gives the n-th log's.

@@ -199,7 +199,7 @@ impl Shell {
                 assert!(carried.map(|entry| entry.0.len()).sum::<usize>() <= config().gossip.delta_bytes_max);
             }
             Message::BlobReply { total, .. } => assert!(total as usize <= BLOB_LEN_MAX),
-            Message::AlignReply { .. } | Message::LifeReply(_) | Message::RosterReply(_) => {}
+            Message::AlignReply { .. } | Message::LifeReply(_) => {}
             other => panic!("{other:?} is no answer"),
         }
     }
