@@ -6,6 +6,7 @@ use crate::commands::{BadInput, align, check, doctor, graph, keys, replay, run, 
 use crate::config::FileConfigError;
 use crate::demo::{self, DemoArgs};
 use crate::host::HostError;
+use crate::trust::TrustError;
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 use merganser_recording::{Problem, RecordingError};
@@ -109,6 +110,7 @@ fn is_bad_input(error: &anyhow::Error) -> bool {
     };
     error.downcast_ref::<FileConfigError>().is_some()
         || error.downcast_ref::<CertificateError>().is_some_and(is_bad_certificate)
+        || error.downcast_ref::<TrustError>().is_some_and(is_bad_key)
         || matches!(host, Some(HostError::Config(_)))
         || error.chain().any(is_bad)
 }
@@ -117,6 +119,14 @@ fn is_bad_certificate(error: &CertificateError) -> bool {
     match &error.problem {
         certificates::Problem::Io(error) => is_not_there(error),
         certificates::Problem::Make(_) | certificates::Problem::Exists => false,
+        _ => true,
+    }
+}
+
+fn is_bad_key(error: &TrustError) -> bool {
+    match error {
+        TrustError::Io { source, .. } => is_not_there(source),
+        TrustError::Random(_) => false,
         _ => true,
     }
 }

@@ -6,6 +6,7 @@ mod zenoh;
 
 use crate::certificates::credentials::{Credentials, Files, Members};
 use crate::certificates::{CertificateError, Holder};
+use crate::trust::passphrase::Passphrase;
 use crate::trust::{PublicKey, SecretKey, TrustError};
 use merganser_protocol::agent::Identity;
 use merganser_protocol::ids::Name;
@@ -28,6 +29,12 @@ pub struct FileConfig {
     pub robot: Name,
     /// The file that holds this robot's secret key; relative to the configuration file's folder.
     pub key_file: PathBuf,
+    /// The file whose first line is the passphrase of an encrypted key file; relative to the configuration file's folder.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub key_passphrase_file: Option<PathBuf>,
+    /// The environment variable that holds it instead.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub key_passphrase_env: Option<String>,
     /// Name and public key of every robot of the swarm, this one included.
     pub roster: BTreeMap<Name, PublicKey>,
     /// Name and public key of those who may read views by TLS; none of them is a robot.
@@ -191,6 +198,8 @@ impl FileConfig {
             swarm,
             robot,
             key_file,
+            key_passphrase_file: None,
+            key_passphrase_env: None,
             roster,
             observers: BTreeMap::new(),
             store: StoreConfig::default(),
@@ -212,8 +221,11 @@ impl FileConfig {
         let folder = path.parent().unwrap_or(Path::new("."));
         config.key_file = folder.join(&config.key_file);
         config.store.path = folder.join(&config.store.path);
-        let zenoh = &mut config.zenoh;
-        for file in [&mut zenoh.input_users_file, &mut zenoh.certificate, &mut zenoh.authority].into_iter().flatten() {
+        let (zenoh, passphrase) = (&mut config.zenoh, &mut config.key_passphrase_file);
+        for file in [passphrase, &mut zenoh.input_users_file, &mut zenoh.certificate, &mut zenoh.authority]
+            .into_iter()
+            .flatten()
+        {
             *file = folder.join(&file);
         }
         Ok(config)
@@ -253,6 +265,10 @@ impl FileConfig {
             let mend =
                 format!("{:?} is not in [roster]; add the line that `keys generate` printed", self.robot.as_str());
             return Err(ValueError { key: "robot".into(), mend });
+        }
+        if self.key_passphrase_file.is_some() && self.key_passphrase_env.is_some() {
+            let mend = "key_passphrase_env is set, too; keep one of the two".into();
+            return Err(ValueError { key: "key_passphrase_file".into(), mend });
         }
         let mut names_by_key = BTreeMap::new();
         for (name, key) in &self.roster {
@@ -305,7 +321,16 @@ impl FileConfig {
         let files = Files { certificate, authority };
         let kind = if self.observers.contains_key(&self.robot) { Holder::Observer } else { Holder::Robot };
         let holder = kind(self.robot.clone());
-        Ok(Some(Credentials::load(files, &self.swarm, &holder, &SecretKey::load(&self.key_file)?)?))
+        Ok(Some(Credentials::load(files, &self.swarm, &holder, &self.secret_key()?)?))
+    }
+
+    /// Reads the secret key file.
+    ///
+    /// # Errors
+    /// [`FileConfigError::Trust`].
+    pub fn secret_key(&self) -> Result<SecretKey, FileConfigError> {
+        let passphrase = Passphrase::of(self.key_passphrase_file.clone(), self.key_passphrase_env.clone());
+        Ok(SecretKey::load_with(&self.key_file, &passphrase)?)
     }
 
     /// All who may link by TLS.
@@ -324,7 +349,7 @@ impl FileConfig {
                 format!("is the key of the observer {}, who is no robot: only `merganser watch` takes it", self.robot);
             return Err(FileConfigError::Value { path: self.key_file.clone(), line: None, message });
         }
-        let secret = SecretKey::load(&self.key_file)?;
+        let secret = self.secret_key()?;
         if self.roster.get(&self.robot) != Some(&secret.public()) {
             let message = format!(
                 "holds the key with the public half {}, but [roster] has another for {}",
@@ -336,7 +361,7 @@ impl FileConfig {
         Ok(Identity {
             swarm: self.swarm.clone(),
             name: self.robot.clone(),
-            secret_key: secret.to_bytes(),
+            secret_key: *secret.to_bytes(),
             roster: self.roster.iter().map(|(name, key)| (name.clone(), key.to_bytes())).collect(),
         })
     }

@@ -41,6 +41,7 @@ pub fn owner(config: &FileConfig) -> Owner {
 /// [`StoreError`].
 pub fn open(config: &FileConfig) -> Result<Opened, StoreError> {
     let medium = FileMedium::new(&config.store.path);
+    let loose = medium.clone();
     let now = SystemTime::now();
     let opened = match Store::open(medium.clone(), owner(config), fresh_epoch(now)) {
         Err(StoreError::Damaged { .. }) if config.store.on_damage == OnDamage::Renew => {
@@ -50,6 +51,10 @@ pub fn open(config: &FileConfig) -> Result<Opened, StoreError> {
         opened => opened?,
     };
     tell(&opened.report);
+    if let Some(mode) = loose.loose_mode() {
+        let store = config.store.path.display();
+        warn!("the store {store} has mode {mode:04o}: others may read or change it; run `chmod 600 {store}`");
+    }
     Ok(opened)
 }
 

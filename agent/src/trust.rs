@@ -1,8 +1,11 @@
 //! Who is who: ed25519 keys as hexadecimal text. A robot's secret lives in a file of its own that only its user may
 //! read; everybody's public halves stand in the roster of the configuration.
 
+pub mod passphrase;
+
 use core::fmt;
 use ed25519_dalek::{SigningKey, VerifyingKey};
+use passphrase::Passphrase;
 use rand::{TryRng, rngs::SysRng};
 use serde::{Deserialize, Serialize};
 use std::fs::OpenOptions;
@@ -10,11 +13,12 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
+use zeroize::Zeroizing;
 
 /// Bytes of a key.
 pub const KEY_LEN: usize = 32;
-/// Largest key file read, in bytes: 64 digits and some white space.
-const KEY_FILE_LEN_MAX: u64 = 256;
+/// Largest key file read, in bytes: 64 digits, or an encrypted key in PEM, and some white space.
+const KEY_FILE_LEN_MAX: u64 = 1024;
 /// Permission bits that a secret key file must not have.
 const OTHERS: u32 = 0o077;
 
@@ -45,6 +49,36 @@ pub enum TrustError {
         /// What is wrong with it.
         source: KeyError,
     },
+    /// The file is encrypted, and no passphrase is named.
+    #[error(
+        "key file {path} is encrypted: name its passphrase by key_passphrase_file or key_passphrase_env in the \
+         configuration, or by --passphrase-file or --passphrase-env"
+    )]
+    Encrypted {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file is not encrypted, though a passphrase is named.
+    #[error("key file {path} is not encrypted, but a passphrase is named for it; name none, or encrypt the key")]
+    NotEncrypted {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file says that it is encrypted, and is no such file.
+    #[error("key file {path} is damaged: it begins as an encrypted key does, and is none; take a copy of it")]
+    NoEncryptedKey {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The passphrase does not open the file.
+    #[error("key file {path}: the passphrase is wrong")]
+    WrongPassphrase {
+        /// The file.
+        path: PathBuf,
+    },
+    /// There is no passphrase where one should be.
+    #[error("passphrase: {0}")]
+    Passphrase(String),
     /// The system gives no randomness.
     #[error("the system's random source failed: {0}")]
     Random(String),
@@ -138,9 +172,9 @@ impl SecretKey {
         Self(SigningKey::from_bytes(&bytes))
     }
 
-    /// The 32 bytes.
-    pub fn to_bytes(&self) -> [u8; KEY_LEN] {
-        self.0.to_bytes()
+    /// The 32 bytes, which are wiped from memory when they are dropped.
+    pub fn to_bytes(&self) -> Zeroizing<[u8; KEY_LEN]> {
+        Zeroizing::new(self.0.to_bytes())
     }
 
     /// The public half.
@@ -148,31 +182,60 @@ impl SecretKey {
         PublicKey(self.0.verifying_key().to_bytes())
     }
 
-    /// Reads a key file: 64 hexadecimal digits, readable by its owner alone.
+    /// Reads a key file that is not encrypted: 64 hexadecimal digits, readable by its owner alone.
     ///
     /// # Errors
     /// [`TrustError`] that says what is wrong with the file.
     pub fn load(path: &Path) -> Result<Self, TrustError> {
+        Self::load_with(path, &Passphrase::None)
+    }
+
+    /// Reads a key file that is readable by its owner alone: encrypted, if a passphrase is named, and else plain.
+    ///
+    /// # Errors
+    /// [`TrustError`] that says what is wrong with the file or the passphrase.
+    pub fn load_with(path: &Path, passphrase: &Passphrase) -> Result<Self, TrustError> {
         let io = |source| TrustError::Io { path: path.into(), source };
         let file = std::fs::File::open(path).map_err(io)?;
         let mode = file.metadata().map_err(io)?.permissions().mode() & 0o7777;
         if mode & OTHERS != 0 {
             return Err(TrustError::Mode { path: path.into(), mode });
         }
-        let mut text = String::new();
+        // With room for all of it, no copy is left behind by growing.
+        let mut text = Zeroizing::new(String::with_capacity(KEY_FILE_LEN_MAX as usize + 1));
         file.take(KEY_FILE_LEN_MAX).read_to_string(&mut text).map_err(io)?;
-        let bytes = parse_hex(text.trim()).map_err(|source| TrustError::Content { path: path.into(), source })?;
-        Ok(Self::from_bytes(bytes))
+        match (passphrase.read()?, passphrase::is_encrypted(&text)) {
+            (Some(words), true) => passphrase::decrypt(&text, &words, path),
+            (None, true) => Err(TrustError::Encrypted { path: path.into() }),
+            (Some(_), false) => Err(TrustError::NotEncrypted { path: path.into() }),
+            (None, false) => {
+                let bytes = parse_hex(text.trim()).map(Zeroizing::new);
+                let bytes = bytes.map_err(|source| TrustError::Content { path: path.into(), source })?;
+                Ok(Self::from_bytes(*bytes))
+            }
+        }
     }
 
-    /// Writes a new key file with mode 0600. An existing file is left alone: keys are never overwritten.
+    /// Writes a new key file with mode 0600, not encrypted. An existing file is left alone: keys are never overwritten.
     ///
     /// # Errors
     /// [`TrustError::Io`].
     pub fn save(&self, path: &Path) -> Result<(), TrustError> {
+        self.save_with(path, &Passphrase::None)
+    }
+
+    /// The same, encrypted if a passphrase is named.
+    ///
+    /// # Errors
+    /// [`TrustError`].
+    pub fn save_with(&self, path: &Path, passphrase: &Passphrase) -> Result<(), TrustError> {
         let io = |source| TrustError::Io { path: path.into(), source };
+        let text = match passphrase.read()? {
+            Some(words) => passphrase::encrypt(self, &words)?,
+            None => Zeroizing::new(to_hex(&*self.to_bytes()) + "\n"),
+        };
         let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path).map_err(io)?;
-        writeln!(file, "{}", to_hex(&self.to_bytes())).map_err(io)?;
+        file.write_all(text.as_bytes()).map_err(io)?;
         file.sync_all().map_err(io)
     }
 }

@@ -119,6 +119,43 @@ fn a_generated_key_makes_a_good_configuration() {
     assert_eq!(said.lines().count(), 1, "{said}");
 }
 
+/// The private half never lies on the disk in the clear; whoever has the file alone has nothing.
+#[test]
+fn an_encrypted_key_starts_by_its_passphrase_and_else_tells_why_not() {
+    let dir = tempfile::tempdir().unwrap();
+    for (file, words) in [("good", "correct horse\n"), ("wrong", "correct house\n")] {
+        std::fs::write(dir.path().join(file), words).unwrap();
+        std::fs::set_permissions(dir.path().join(file), std::fs::Permissions::from_mode(0o600)).unwrap();
+    }
+    let out = merganser(&["keys", "generate", "--name", "alpha", "--passphrase-file", "good"], dir.path());
+    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
+    assert!(std::fs::read_to_string(dir.path().join("alpha.key")).unwrap().contains("ENCRYPTED PRIVATE KEY"));
+    let config = |more: &str| {
+        let roster =
+            format!("[roster]\n{}[zenoh]\nmulticast = false\nlisten = [\"tcp/127.0.0.1:7999\"]\n", text(&out.stdout));
+        let text = format!("swarm = \"demo\"\nrobot = \"alpha\"\nkey_file = \"alpha.key\"\n{more}\n{roster}");
+        std::fs::write(dir.path().join("alpha.toml"), text).unwrap();
+        let told = merganser(&["check", "-c", "alpha.toml"], dir.path());
+        (told.status.code(), String::from_utf8(told.stderr).unwrap())
+    };
+    assert_eq!(config("key_passphrase_file = \"good\"").0, Some(0));
+    for (more, wanted) in [
+        ("key_passphrase_file = \"wrong\"", "the passphrase is wrong"),
+        ("key_passphrase_file = \"none\"", "none"),
+        ("key_passphrase_env = \"MERGANSER_NO_SUCH_VARIABLE\"", "MERGANSER_NO_SUCH_VARIABLE is not set"),
+        ("", "key_passphrase_file"),
+        ("key_passphrase_env = \"A\"\nkey_passphrase_file = \"good\"", "keep one of the two"),
+    ] {
+        let (code, told) = config(more);
+        assert!(code == Some(2) && told.contains(wanted) && told.lines().count() == 1, "{more}: {code:?} {told}");
+    }
+    let show = |options: &[&str]| {
+        merganser(&[&["keys", "show", "--name", "alpha", "--key", "alpha.key"], options].concat(), dir.path())
+    };
+    assert_eq!(show(&["--passphrase-file", "good"]).stdout, out.stdout);
+    assert_eq!(show(&["--passphrase-file", "wrong"]).status.code(), Some(2));
+}
+
 /// `dist/default.toml` claims to show the defaults: take every line away that has one, and nothing may change.
 #[test]
 fn the_commented_defaults_are_the_defaults() {

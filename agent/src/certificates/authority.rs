@@ -3,6 +3,7 @@
 
 use super::{Certificate, CertificateError, Holder, Problem, pem, read_bounded};
 use crate::trust::PublicKey;
+use crate::trust::passphrase::key_der;
 use core::fmt;
 use merganser_protocol::ids::Name;
 use rand::{TryRng, rngs::SysRng};
@@ -15,6 +16,7 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use time::{Duration, OffsetDateTime};
+use zeroize::Zeroizing;
 
 /// Longest validity, in days.
 pub const DAYS_MAX: u32 = 36_500;
@@ -100,9 +102,9 @@ impl Authority {
         if mode & OTHERS != 0 {
             return Err(at(Problem::Mode { mode, path: key.clone() }));
         }
-        let text = read_bounded(key).map_err(at)?;
-        let text = String::from_utf8(text).map_err(|_| at(Problem::NoKey))?;
-        let secret = KeyPair::from_pkcs8_pem_and_sign_algo(&text, &PKCS_ED25519).map_err(|_| at(Problem::NoKey))?;
+        let text = Zeroizing::new(read_bounded(key).map_err(at)?);
+        let text = core::str::from_utf8(&text).map_err(|_| at(Problem::NoKey))?;
+        let secret = KeyPair::from_pkcs8_pem_and_sign_algo(text, &PKCS_ED25519).map_err(|_| at(Problem::NoKey))?;
         let certificate = Certificate::load(path)?;
         let Holder::Swarm(swarm) = certificate.holder.clone() else { return Err(Problem::NoAuthority.at(path)) };
         if !certificate.is_authority {
@@ -123,7 +125,7 @@ impl Authority {
     /// [`CertificateError`].
     pub fn save(&self, files: &Files) -> Result<(), CertificateError> {
         write_new(&files.certificate, self.certificate.pem(), 0o644)?;
-        write_new(&files.key, &self.key.serialize_pem(), 0o600).inspect_err(|_| {
+        write_new(&files.key, &Zeroizing::new(self.key.serialize_pem()), 0o600).inspect_err(|_| {
             // Beside another key it would be of no use, and in the way of the next try.
             let _ = fs::remove_file(&files.certificate);
         })
@@ -197,11 +199,9 @@ fn made(reason: impl fmt::Display) -> Problem {
     Problem::Make(reason.to_string())
 }
 
-/// A secret ed25519 key in PEM (PKCS #8, RFC 8410).
-pub fn key_pem(secret: &[u8; 32]) -> String {
-    let mut der = vec![0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20];
-    der.extend_from_slice(secret);
-    pem("PRIVATE KEY", &der)
+/// A secret ed25519 key in PEM (PKCS #8, RFC 8410), wiped from memory when it is dropped.
+pub fn key_pem(secret: &[u8; 32]) -> Zeroizing<String> {
+    Zeroizing::new(pem("PRIVATE KEY", &key_der(secret)))
 }
 
 /// Writes a file that is not there yet.

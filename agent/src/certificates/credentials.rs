@@ -8,6 +8,7 @@ use core::fmt;
 use merganser_protocol::ids::Name;
 use std::collections::BTreeSet;
 use std::path::Path;
+use zeroize::Zeroizing;
 
 /// Everybody with a part in a swarm, by name.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -27,7 +28,7 @@ pub struct Credentials {
     pub authority: Certificate,
     /// The holder's own.
     pub certificate: Certificate,
-    key_pem: String,
+    key_pem: Zeroizing<String>,
 }
 
 impl fmt::Debug for Credentials {

@@ -5,12 +5,31 @@ use super::{BadInput, say};
 use crate::certificates::authority::{AUTHORITY_DAYS, Authority, DAYS, DAYS_MAX, Files, write_new, write_over};
 use crate::certificates::{Holder, Problem, router};
 use crate::config::FileConfig;
+use crate::trust::passphrase::Passphrase;
 use crate::trust::{PublicKey, SecretKey};
 use anyhow::{Context, Result};
 use clap::Subcommand;
 use merganser_protocol::ids::Name;
 use std::collections::BTreeMap;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
+
+/// Where the passphrase of an encrypted key file is.
+#[derive(Clone, Debug, clap::Args)]
+pub struct PassphraseArgs {
+    /// The key file is encrypted; its passphrase is the first line of this file, which only its owner may read.
+    #[arg(long, value_name = "FILE", conflicts_with = "passphrase_env")]
+    passphrase_file: Option<PathBuf>,
+    /// The key file is encrypted; its passphrase is in this environment variable.
+    #[arg(long, value_name = "VARIABLE")]
+    passphrase_env: Option<String>,
+}
+
+impl PassphraseArgs {
+    pub(super) fn passphrase(&self) -> Passphrase {
+        Passphrase::of(self.passphrase_file.clone(), self.passphrase_env.clone())
+    }
+}
 
 /// What `merganser keys` can be told.
 #[derive(Clone, Debug, Subcommand)]
@@ -23,6 +42,9 @@ pub enum KeysCommand {
         /// The folder for `NAME.key`.
         #[arg(long, value_name = "DIR", default_value = ".")]
         out: PathBuf,
+        /// Encrypt it.
+        #[command(flatten)]
+        passphrase: PassphraseArgs,
     },
     /// Print the roster line of a key file.
     Show {
@@ -32,6 +54,9 @@ pub enum KeysCommand {
         /// The key file.
         #[arg(long, value_name = "FILE")]
         key: PathBuf,
+        /// If it is encrypted.
+        #[command(flatten)]
+        passphrase: PassphraseArgs,
     },
     /// Make a swarm's authority, which signs certificates; keep its key off the robots.
     Authority {
@@ -89,7 +114,7 @@ pub enum KeysCommand {
     },
 }
 
-fn name(text: &str) -> Result<Name, String> {
+pub(super) fn name(text: &str) -> Result<Name, String> {
     Name::new(text).map_err(|error| error.to_string())
 }
 
@@ -110,13 +135,16 @@ fn endpoint(text: &str) -> Result<String, String> {
 /// If a file exists already that must not be overwritten, or cannot be written or read.
 pub fn run(command: KeysCommand) -> Result<bool> {
     match command {
-        KeysCommand::Generate { name, out } => {
+        KeysCommand::Generate { name, out, passphrase } => {
             make_folder(&out)?;
             let key = SecretKey::generate()?;
-            key.save(&out.join(format!("{name}.key")))?;
+            key.save_with(&out.join(format!("{name}.key")), &passphrase.passphrase())?;
             say(&format!("{name} = \"{}\"", key.public()))?;
         }
-        KeysCommand::Show { name, key } => say(&format!("{name} = \"{}\"", SecretKey::load(&key)?.public()))?,
+        KeysCommand::Show { name, key, passphrase } => {
+            let key = SecretKey::load_with(&key, &passphrase.passphrase())?;
+            say(&format!("{name} = \"{}\"", key.public()))?;
+        }
         KeysCommand::Authority { swarm, days, out } => {
             make_folder(&out)?;
             let files = Files::of(&swarm, &out);
@@ -165,8 +193,13 @@ fn told(path: &Path, what: &str) -> String {
     format!("{}: {what}", path.display())
 }
 
-fn make_folder(out: &Path) -> Result<()> {
-    std::fs::create_dir_all(out).with_context(|| format!("cannot make the folder {}", out.display()))
+pub(super) fn make_folder(out: &Path) -> Result<()> {
+    // What is there stays as it is; what is made holds keys.
+    std::fs::DirBuilder::new()
+        .recursive(true)
+        .mode(0o700)
+        .create(out)
+        .with_context(|| format!("cannot make the folder {}", out.display()))
 }
 
 /// An authority and a configuration of one swarm.

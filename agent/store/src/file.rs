@@ -4,14 +4,20 @@
 use crate::mend::Medium;
 use redb::{Builder, Database, DatabaseError};
 use std::ffi::OsString;
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::io;
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 /// Damaged files kept beside the store. Of more, the smallest goes, the oldest of several; the newest always stays. Large
 /// ones may hold what nobody else has, and a disk that fails again and again leaves many small ones.
 pub const DAMAGED_KEPT_MAX: usize = 4;
+
+/// Permission bits of a store.
+const OWNER_ONLY: u32 = 0o600;
+/// Those that it must not have.
+const OTHERS: u32 = 0o077;
 
 /// See the module.
 #[derive(Clone, Debug)]
@@ -32,6 +38,13 @@ impl FileMedium {
         let last = kept.last().map_or(0, |(number, ..)| *number);
         let files = kept.into_iter().map(|(.., path)| path).chain([self.path.clone()]);
         (files.filter_map(|path| fs::metadata(path).ok()?.modified().ok()).max(), last)
+    }
+
+    /// The permission bits of a store that others than its owner may read or write; such a one was made by an earlier
+    /// version, or changed since.
+    pub fn loose_mode(&self) -> Option<u32> {
+        let mode = fs::metadata(&self.path).ok()?.permissions().mode() & 0o7777;
+        (mode & OTHERS != 0).then_some(mode)
     }
 
     fn beside(&self, suffix: &str) -> PathBuf {
@@ -80,12 +93,21 @@ impl FileMedium {
     }
 }
 
+/// Has a file that is not there yet be readable by its owner alone: it is made here, empty, for the database to fill.
+fn owned(path: &Path) -> io::Result<()> {
+    match OpenOptions::new().write(true).create_new(true).mode(OWNER_ONLY).open(path) {
+        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => Err(error),
+        _ => Ok(()),
+    }
+}
+
 impl Medium for FileMedium {
     fn path(&self) -> &Path {
         &self.path
     }
 
     fn create(&self, builder: &Builder) -> Result<Database, DatabaseError> {
+        owned(&self.path)?;
         builder.create(&self.path)
     }
 
@@ -93,7 +115,10 @@ impl Medium for FileMedium {
         let spare = self.beside(".new");
         match fs::remove_file(&spare) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error.into()),
-            _ => builder.create(&spare),
+            _ => {
+                owned(&spare)?;
+                builder.create(&spare)
+            }
         }
     }
 

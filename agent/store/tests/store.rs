@@ -10,6 +10,7 @@ use merganser_protocol::ids::{EntryId, FrameId, Hash, RobotId, SubmapId};
 use merganser_store::simulated::Disk;
 use merganser_store::{CommitError, FileMedium, Owner, Schema, Store, StoreError, inspect};
 use redb::{Database, ReadableDatabase, TableDefinition};
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 const META: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("meta");
@@ -314,5 +315,20 @@ fn a_failed_commit_is_repeated_and_then_all_is_there() {
             assert_eq!(opened.restored.records.len(), 10, "after {after}, full {full}: {:?}", opened.report);
             assert_eq!(opened.report.damaged_count, 0, "after {after}, full {full}: {:?}", opened.report);
         }
+    }
+}
+
+#[test]
+fn a_store_is_its_owners_alone_from_the_start_and_one_that_is_not_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.redb");
+    let medium = FileMedium::new(&path);
+    assert_eq!(medium.loose_mode(), None, "not there yet");
+    drop(Store::open(medium.clone(), owner(), 1).unwrap());
+    let mode = || std::fs::metadata(&path).unwrap().permissions().mode() & 0o7777;
+    assert_eq!((mode(), medium.loose_mode()), (0o600, None));
+    for (loose, told) in [(0o400, None), (0o640, Some(0o640)), (0o602, Some(0o602))] {
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(loose)).unwrap();
+        assert_eq!(medium.loose_mode(), told);
     }
 }

@@ -169,7 +169,7 @@ fn real_core_of_nobody() -> Agent {
     let identity = merganser_protocol::agent::Identity {
         swarm: name("test"),
         name: name("nobody"),
-        secret_key: key.to_bytes(),
+        secret_key: *key.to_bytes(),
         roster: [(name("nobody"), key.public().to_bytes())].into(),
     };
     Agent::new(Default::default(), identity, 0, Default::default(), Instant::ZERO).unwrap()

@@ -20,7 +20,7 @@ impl ACore {
     pub fn new(config: Config) -> Self {
         let (key, name) = (SecretKey::from_bytes([1; 32]), Name::new("alpha").unwrap());
         let roster = [(name.clone(), key.public().to_bytes())].into();
-        let identity = Identity { swarm: Name::new("test").unwrap(), name, secret_key: key.to_bytes(), roster };
+        let identity = Identity { swarm: Name::new("test").unwrap(), name, secret_key: *key.to_bytes(), roster };
         let agent = Agent::new(config, identity, 1, Default::default(), Instant::ZERO).unwrap();
         Self { agent, now: Instant::ZERO }
     }

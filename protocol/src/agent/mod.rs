@@ -37,6 +37,7 @@ use mapping::Mapping;
 use replication::Replication;
 use std::collections::BTreeMap;
 use thiserror::Error;
+use zeroize::Zeroize;
 
 pub use self::core::Core;
 pub use alignment::{
@@ -103,13 +104,14 @@ impl Agent {
     /// [`StartError`] for a bad configuration, roster or store.
     pub fn new(
         config: Config,
-        identity: Identity,
+        mut identity: Identity,
         seed: u64,
         restored: Restored,
         now: Instant,
     ) -> Result<Self, StartError> {
         config.validate()?;
         let key = SigningKey::from_bytes(&identity.secret_key);
+        identity.secret_key.zeroize(); // the one copy left is wiped with the agent
         let public = key.verifying_key().to_bytes();
         if identity.roster.get(&identity.name) != Some(&public) {
             return Err(StartError::NotInRoster(identity.name));

@@ -40,6 +40,16 @@ pub const HEADS_MAX: usize = 2048;
 pub const MEMBERS_MAX: usize = HEADS_MAX + 1;
 /// Fork proofs in one answer at most.
 pub const FORKS_PER_DELTA_MAX: usize = 8;
+/// Longest signed roster, its signature included.
+pub const ROSTER_LEN_MAX: usize = 64 * 1024;
+/// Robots in a signed roster at most.
+pub const ROSTER_MEMBERS_MAX: usize = 1024;
+/// Observers in a signed roster at most.
+pub const ROSTER_OBSERVERS_MAX: usize = 64;
+/// Revoked keys in a signed roster at most.
+pub const ROSTER_REVOKED_MAX: usize = 256;
+/// Epochs of one revoked key that can stay.
+pub const KEPT_EPOCHS_MAX: usize = 64;
 
 /// Largest coordinate of a translation, in frame units.
 pub const TRANSLATION_MAX: f64 = 1e9;

@@ -19,6 +19,9 @@ mod limits_tests;
 pub mod messages;
 pub mod payload;
 pub mod pose;
+pub mod roster;
+#[cfg(test)]
+pub(crate) mod roster_tests;
 #[cfg(test)]
 pub(crate) mod samples;
 pub mod slice;
@@ -33,3 +36,4 @@ pub use have::{HaveRoot, HaveVector, Head, Members};
 pub use life::{BeaconAge, Life, LifeContent, Nonce};
 pub use messages::{AlignStatus, Delta, Message};
 pub use payload::FactError;
+pub use roster::{Roster, RosterContent, RosterHead};

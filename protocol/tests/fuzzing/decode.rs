@@ -9,9 +9,10 @@ use merganser_protocol::replica::Replica;
 use merganser_protocol::submap::{Features, Keypoints, Summary, Surfel};
 use merganser_protocol::wire::fact::{Fact, RefusalReason, VerdictFact, VerdictOutcome};
 use merganser_protocol::wire::limits::{
-    BLOB_LEN_MAX, CARRIED_MAX, ENTRY_LEN_MAX, MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX, PAYLOAD_LEN_MAX, SUMMARY_LEN_MAX,
+    BLOB_LEN_MAX, CARRIED_MAX, ENTRY_LEN_MAX, MESSAGE_LEN_MAX, MESSAGE_OVERHEAD_MAX, PAYLOAD_LEN_MAX, ROSTER_LEN_MAX,
+    SUMMARY_LEN_MAX,
 };
-use merganser_protocol::wire::{Delta, Entry, HaveVector, Message, SwarmTag};
+use merganser_protocol::wire::{Delta, Entry, HaveVector, Message, Roster, SwarmTag};
 
 /// Fact kinds 1 to 7 and one on either side.
 const KINDS: core::ops::RangeInclusive<u8> = 0..=8;
@@ -29,6 +30,21 @@ pub fn decode(bytes: &[u8], meter: &impl Meter) {
         check_fact(kind, bytes, meter);
     }
     check_blobs(bytes, meter);
+    meter.begin();
+    let roster = Roster::decode(bytes);
+    meter.end("a roster");
+    if let Ok(roster) = roster {
+        check_roster(bytes, &roster);
+    }
+}
+
+/// What is read says the same again, and names nobody twice.
+fn check_roster(bytes: &[u8], roster: &Roster) {
+    assert_eq!(roster.encode(), bytes, "a roster has one form");
+    assert!(bytes.len() <= ROSTER_LEN_MAX);
+    let listed: std::collections::BTreeSet<_> = roster.listed().map(|listed| listed.robot).collect();
+    assert_eq!(listed.len(), roster.listed().count());
+    assert!(!roster.supersedes(roster) && !roster.is_fork_of(roster));
 }
 
 fn check_message(bytes: &[u8], message: &Message, meter: &impl Meter) {
