@@ -142,6 +142,17 @@ fn strangers(config: &Config) -> Wires {
     wires
 }
 
+#[test]
+fn what_was_tried_in_vain_is_told_by_frame_count_and_reason() {
+    let wires = strangers(&config());
+    let seen = wires.agents[0].snapshot(wires.now);
+    let [tries] = &seen.frames.tries[..] else { panic!("{:?}", seen.frames.tries) };
+    assert_eq!((tries.found, tries.tried() as usize), (0, tried(&wires).len()), "{tries:?}");
+    let told = tries.told().unwrap();
+    assert!(tries.other.starts_with("beta/") && told.contains("tried and none aligned"), "{told}");
+    assert!(seen.frames.pairs.is_empty());
+}
+
 /// The two start again.
 fn again(config: &Config, disks: &[Vec<Record>]) -> Wires {
     let mut wires = Wires::new((0..2).map(|k| started(k, config, disks[k].clone())).collect());
