@@ -59,7 +59,8 @@ pub fn w_first_in<'a>(graph: &PoseGraph, measurements: impl Iterator<Item = &'a 
         .filter_map(|m| Some([value(&m.i)?, value(&m.j)?, m.t_i_j.rotation]))
         .collect();
     if half_turns(&measurements) {
-        return Some(if joined.is_empty() { WFirst::Edges } else { WFirst::All });
+        let are_all = !joined.is_empty() && off(&joined, w_first, w_first) < off(&joined, as_read, w_first);
+        return Some(if are_all { WFirst::All } else { WFirst::Edges });
     }
     if joined.len() >= MEASUREMENTS_MIN {
         return contradiction(&joined);
@@ -79,20 +80,28 @@ fn half_turns(measurements: &[&Measurement]) -> bool {
     all >= MEASUREMENTS_MIN && halves as f64 >= STEPS_SHARE * all as f64
 }
 
+/// Reads a rotation in an order.
+type Order = fn(&So3) -> So3;
+
+fn as_read(read: &So3) -> So3 {
+    *read
+}
+
+/// The median angle, rad, between values of poses and measurements between them, each in an order.
+fn off(joined: &[[So3; 3]], of_values: Order, of_edges: Order) -> f64 {
+    let one = |[i, j, edge]: &[So3; 3]| (of_edges(edge).inverse() * of_values(i).inverse() * of_values(j)).angle();
+    let mut angles: Vec<f64> = joined.iter().map(one).collect();
+    let middle = angles.len() / 2;
+    *angles.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
 /// Which order lets values and measurements agree, if the one that was read does not.
 fn contradiction(joined: &[[So3; 3]]) -> Option<WFirst> {
-    let median = |of_values: fn(&So3) -> So3, of_edges: fn(&So3) -> So3| {
-        let off = |[i, j, edge]: &[So3; 3]| (of_edges(edge).inverse() * of_values(i).inverse() * of_values(j)).angle();
-        let mut angles: Vec<f64> = joined.iter().map(off).collect();
-        let middle = angles.len() / 2;
-        *angles.select_nth_unstable_by(middle, f64::total_cmp).1
-    };
-    let as_read: fn(&So3) -> So3 = |read| *read;
-    let stated = median(as_read, as_read);
+    let stated = off(joined, as_read, as_read);
     let others = [
-        (WFirst::All, median(w_first, w_first)),
-        (WFirst::Vertices, median(w_first, as_read)),
-        (WFirst::Edges, median(as_read, w_first)),
+        (WFirst::All, off(joined, w_first, w_first)),
+        (WFirst::Vertices, off(joined, w_first, as_read)),
+        (WFirst::Edges, off(joined, as_read, w_first)),
     ];
     let (which, best) = others.into_iter().reduce(|a, b| if b.1 < a.1 { b } else { a })?;
     let is_clear = best <= AGREE_MAX && stated >= CONTRADICT_MIN && stated >= CONTRADICT_RATIO * best;
