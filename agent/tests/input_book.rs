@@ -10,8 +10,9 @@ use std::path::{Path, PathBuf};
 const LETTERS_MIN: usize = 12;
 
 /// Messages that tests expect by what they are in the program, and not by their words.
-const BY_KIND: [(&str, &str); 5] = [
+const BY_KIND: [(&str, &str); 6] = [
     ("views of one submap do not fit together", "it_takes_a_full_window_and_its_median"),
+    ("the body is tilted by", "a_tilted_body_is_refused"),
     ("taken for metres; if they are millimetres", "Remark::Whole"),
     ("wants more than 128 MiB", "a_packed_log_that_wants_a_large_dictionary"),
     ("m from the body in a cloud", "Problem::Offset"),

@@ -88,13 +88,15 @@ async fn keyframes_that_are_too_large_leave_a_gap_that_is_counted_and_not_known(
     for index in 1..12 {
         send(&slam, &ahead(index, 400)).await;
     }
-    until("what was sent", async || seen(&alpha, "too_large").await.0[0] == 12).await;
+    // Where the body is, is known once the first submap is.
+    let knows = |(counts, sigma): ([u64; 3], f64), taken: u64| counts[0] == taken && sigma > 0.0;
+    until("what was sent", async || knows(seen(&alpha, "too_large").await, 12)).await;
     let before = seen(&alpha, "too_large").await;
     assert!(before.0 == [12, 0, 0] && before.1 < 0.1, "{before:?}");
     for index in 12..32 {
         send(&slam, &ahead(index, if index < 21 { 6_000 } else { 400 })).await;
     }
-    until("what was sent", async || seen(&alpha, "too_large").await.0[0] == 23).await;
+    until("what was sent", async || knows(seen(&alpha, "too_large").await, 23)).await;
     let (counts, sigma) = seen(&alpha, "too_large").await;
     // A tenth of the ten metres.
     assert!(counts == [23, 9, 1] && (0.7..1.5).contains(&sigma), "{counts:?}, {sigma} m");
@@ -135,6 +137,7 @@ async fn keyframes_that_find_the_queue_full_are_counted_to_the_last_and_leave_ga
     let config = configured(dir.path(), |config| {
         config.driver.queue = 16; // of which the SLAM has a quarter
         config.core.submap.distance_m = 100.0;
+        config.core.submap.keyframes_max = 4;
     });
     let opened = store::open(&config).unwrap();
     let clock = Clock::start();
@@ -157,7 +160,7 @@ async fn keyframes_that_find_the_queue_full_are_counted_to_the_last_and_leave_ga
         last += 1;
         tokio::time::sleep(Duration::from_millis(50)).await;
         let [taken, lost, _] = seen(&alpha, "queue_full").await.0;
-        lost > 0 && taken + lost == last as u64
+        lost > 0 && taken + lost == last as u64 && seen(&alpha, "queue_full").await.1 > 0.0
     })
     .await;
     let ([_, _, gaps], sigma) = seen(&alpha, "queue_full").await;
