@@ -274,11 +274,14 @@ fn in_vain(a: &Views, b: &Views) -> String {
         tries.filter(|tries| tries.own == own.frames.own).cloned()
     };
     let both = [of(a, b), of(b, a)].into_iter().flatten().reduce(|one, other| one.and(&other));
-    both.and_then(|tries| tries.told()).unwrap_or_else(|| {
-        "no pair of submaps was tried: no two looked alike, or they have no keypoints; see what merganser doctor says of \
-         both"
-            .into()
-    })
+    let Some(tries) = both else {
+        return "no pair of submaps was tried: no two looked alike, or they have no keypoints; see what merganser doctor says \
+                of both"
+            .into();
+    };
+    let found =
+        || format!("{} pairs of submaps were tried and {} aligned, none of which counts", tries.tried(), tries.found);
+    tries.told().unwrap_or_else(found)
 }
 
 /// How the first bodies of both robots lie, by an estimate and by the truth of `t_a_b`. Both know where they began in

@@ -31,4 +31,6 @@ fn robots_with_nothing_in_common_are_told_what_was_tried() {
         "{text}"
     );
     assert_eq!(text.matches("were tried").count(), 1, "{text}");
+    seen[1].frames.tries[0].found = 2;
+    assert!(told(&seen).contains("17 pairs of submaps were tried and 2 aligned, none of which counts"));
 }

@@ -1,12 +1,13 @@
 //! Whether quaternions that are read `[x, y, z, w]` were written w first: told by how the body moves.
 //!
-//! A quaternion tells nothing of its order by itself, and neighbours that differ little do so in either order. But a body
-//! goes one way in its own axes (ahead, if it drives) whatever its heading is, and in the wrong order that way turns with
-//! the heading. So steps are taken in the axes of the body by both orders. The order is doubted if
-//! - only the other one has steps along one axis ([`ALONG_MIN`], [`ALONG_RATIO`]), or
-//! - the body only ever turns about x, while it moves in the plane of x and y: in the other order it drives in that plane, or
-//! - the first pose is a half turn about x, which is the identity in the other order, and the other order's steps are along
-//!   one axis more clearly ([`ALONG_LEAD`]).
+//! A quaternion tells nothing of its order by itself, and neighbours that differ little do so in either order. But a
+//! body goes one way in its own axes (ahead, if it drives) whatever its heading is, and in the wrong order that way turns
+//! with the heading. So steps are taken in the axes of the body by both orders. The order is doubted if
+//! - only the other one has steps along one axis (`ALONG_MIN`, `ALONG_RATIO`), or
+//! - the body only ever turns about x, while it moves in the plane of x and y: in the other order it drives in that
+//!   plane, or
+//! - the first pose is a half turn about x, which is the identity in the other order, and the other order's steps are
+//!   along one axis more clearly (`ALONG_LEAD`).
 //!
 //! A body that moves any way (a camera in a hand), that goes one straight way, or hardly moves, gives no doubt.
 //!
@@ -48,8 +49,8 @@ pub struct QuaternionOrder {
     last: Option<Se3>,
     /// The first pose's x.
     first: f64,
-    /// Scatter of the steps in the body's axes, as read and in the other order, and in the frame's axes; each step counts by
-    /// its length.
+    /// Scatter of the steps in the body's axes, as read and in the other order, and in the frame's axes; each step counts
+    /// by its length.
     scatters: [Matrix3<f64>; 3],
     /// Sum of the squares of y and z.
     aside: f64,

@@ -58,8 +58,9 @@ impl RefusalReason {
                 "see by merganser doctor whether poses and points are as they are to be, and whether things moved",
             ],
             Self::BadInput => [
-                "keypoints are missing or cannot be read",
-                "see whether all robots run one version, and whether links fail",
+                "there are too few keypoints, or they cannot be read",
+                "see in the log how many keypoints submaps have, and that all robots state the same submap.sensor and voxel_m \
+                 and run one version",
             ],
         }
     }

@@ -2,7 +2,7 @@
 //! and in which order, and how to send them. Looked at only after the strict reader has refused it.
 
 use super::ObservationError;
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, IgnoredAny};
 use serde_json::Value;
 
 /// Numbers of a field, and their order.
@@ -35,9 +35,11 @@ pub(super) fn json<T: DeserializeOwned>(bytes: &[u8], error: &serde_json::Error)
 fn named<T: DeserializeOwned>(bytes: &[u8], error: &serde_json::Error) -> String {
     let mut reader = serde_json::Deserializer::from_slice(bytes);
     let field = serde_path_to_error::deserialize::<_, T>(&mut reader).err().map(|error| error.path().to_string());
-    match field.filter(|field| field != ".") {
-        Some(field) if !error.is_syntax() && !error.is_eof() => format!("{field}: {error}"),
-        _ => error.to_string(),
+    // A text that is no JSON has no fields.
+    let is_json = serde_json::from_slice::<IgnoredAny>(bytes).is_ok();
+    match field.filter(|field| is_json && field != ".") {
+        Some(field) => format!("{field}: {error}"),
+        None => error.to_string(),
     }
 }
 
