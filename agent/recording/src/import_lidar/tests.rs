@@ -429,3 +429,34 @@ fn a_scan_that_is_missing_between_others_is_told_and_a_thinned_sequence_is_none(
         "{thinned:?}"
     );
 }
+
+/// In a recording's own tables, too: each is named once, by `demo`, before anything is fed.
+#[test]
+fn tables_of_a_recording_with_w_first_are_named() {
+    let poses = long(90);
+    let (made, _out) = prepared(|d| {
+        for k in 0..poses.len() {
+            let bytes = floats(points(k % 7).iter().flat_map(|at| [at[0], at[1], at[2], 0.5]));
+            fs::write(d.join(format!("{k:06}.bin")), bytes).unwrap();
+        }
+        fs::write(d.join("poses.txt"), table(&poses, |k| k.to_string())).unwrap();
+    });
+    let recording = made.unwrap().recordings.remove(0);
+    let told = |recording: &Recording| recording.check_clouds().unwrap().told();
+    assert_eq!(told(&recording), Vec::<String>::new());
+    let folder = recording.folder();
+    for name in ["keyframes.csv", "truth.csv"] {
+        let text = fs::read_to_string(folder.join(name)).unwrap();
+        let turned = text.lines().enumerate().map(|(number, line)| {
+            let mut fields: Vec<&str> = line.split(',').collect();
+            if number > 0 {
+                fields[4..8].rotate_right(1);
+            }
+            fields.join(",") + "\n"
+        });
+        fs::write(folder.join(name), turned.collect::<String>()).unwrap();
+        let told = told(&Recording::open(folder).unwrap());
+        assert!(told.len() == 1 && told[0].contains("written w first") && told[0].contains("put w last"), "{told:?}");
+        assert!(told[0].contains("keyframes.csv"), "the first that is so: {told:?}");
+    }
+}

@@ -25,7 +25,7 @@ fn drive(
         .collect();
     let one = |k: u32| {
         let (mut points, mut marks, mut pose) = (Vec::new(), Vec::new(), place(k));
-        for (label, landmark) in (0..).zip(&landmarks).filter(|(label, _)| (label + k) % 3 == 0) {
+        for (label, landmark) in (0..).zip(&landmarks).filter(|(label, _)| (label + k).is_multiple_of(3)) {
             let seen = place(k).inverse() * *landmark;
             let off = noise * Vector3::new((1.7 * f64::from(k)).sin(), (2.3 * f64::from(k)).cos(), 0.0);
             let (sent_pose, point) = send(place(k), seen + off * seen.norm());
