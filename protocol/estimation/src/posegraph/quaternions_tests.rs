@@ -75,8 +75,11 @@ proptest! {
             prop_assert_eq!(found(Some(true), None), Some(WFirst::Vertices));
         }
         prop_assert_eq!(found(Some(true), Some(true)), Some(WFirst::All));
-        prop_assert_eq!(found(Some(true), Some(false)), Some(WFirst::Vertices));
-        prop_assert_eq!(found(Some(false), Some(true)), Some(WFirst::Edges));
+        // Measurements across half a radian contradict values of another order by enough.
+        if turn * apart as f64 > 0.6 {
+            prop_assert_eq!(found(Some(true), Some(false)), Some(WFirst::Vertices));
+            prop_assert_eq!(found(Some(false), Some(true)), Some(WFirst::Edges));
+        }
         // Steps from pose to pose tell it without values as well.
         if apart == 1 {
             prop_assert_eq!(found(None, Some(true)), Some(WFirst::Edges));
