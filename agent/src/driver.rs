@@ -5,6 +5,7 @@
 use crate::journal::{self, Frame, StoredInput};
 use crate::queue::{Inbox, Outbox};
 use crate::store;
+use crate::vain::{self, Vain};
 use merganser_protocol::agent::Core;
 use merganser_protocol::agent::io::{AskToken, Channel, Command, Event, Input, JobId, Output, QueryId, QueryKind};
 use merganser_protocol::agent::job::Job;
@@ -133,6 +134,7 @@ pub struct Driver<C, N> {
     views: mpsc::Receiver<SnapshotRequest>,
     journal_flushed: Instant,
     inputs: u64,
+    vain: Vain,
 }
 
 impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
@@ -140,7 +142,10 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
     pub fn new(parts: Parts<C, N>) -> (Self, Snapshots) {
         let (sender, views) = mpsc::channel(VIEWS_WAITING);
         let workers = Arc::new(Semaphore::new(parts.jobs.max(1)));
-        (Self { parts, workers, views, journal_flushed: Instant::ZERO, inputs: 0 }, Snapshots(sender))
+        (
+            Self { parts, workers, views, journal_flushed: Instant::ZERO, inputs: 0, vain: Vain::default() },
+            Snapshots(sender),
+        )
     }
 
     /// Runs until `stop` comes, then closes the open submap. All batches handed to the store are on disk when it
@@ -210,6 +215,7 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
     }
 
     fn drain(&mut self) {
+        let mut is_vain = false;
         while let Some(output) = self.parts.core.poll_output() {
             match output {
                 Output::Persist { batch, records } => self.parts.store.persist(batch, records),
@@ -219,8 +225,17 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
                 }
                 Output::Answer { token, bytes } => self.parts.network.send(Outgoing::Answer(token, bytes)),
                 Output::Run { id, job } => self.start(id, job),
-                Output::Event(event) => tell(&event),
+                Output::Event(event) => {
+                    tell(&event);
+                    if let Event::AlignmentTried { i, j, found, .. } = event {
+                        is_vain |= self.vain.note(i.frame, j.frame, found);
+                    }
+                }
             }
+        }
+        let seen = if is_vain { self.parts.core.overview(self.parts.clock.now()) } else { None };
+        for told in seen.iter().flat_map(|seen| vain::told(&seen.frames)) {
+            info!("{told}");
         }
     }
 

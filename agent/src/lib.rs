@@ -36,5 +36,6 @@ pub mod queue;
 pub mod store;
 pub mod telemetry;
 pub mod trust;
+mod vain;
 
 pub use merganser_recording::{self as recording, observation};

@@ -239,3 +239,35 @@ fn bad_input_is_told_with_the_file_and_the_cure() {
         assert!(wanted.iter().all(|part| said.contains(part)), "{args:?}: {said}");
     }
 }
+
+/// Two messages as a SLAM sends them, one of each with points that were aligned as clouds above.
+#[test]
+fn keyframes_as_messages_are_aligned_and_bad_ones_told_by_file_and_field() {
+    let dir = tempfile::tempdir().unwrap();
+    let recording = Recording::open(Path::new("recordings/alpha")).unwrap();
+    let save = |index: usize, name: &str, change: &dyn Fn(&mut Value)| {
+        let keyframe = recording.keyframe(index).unwrap();
+        let mut message = serde_json::to_value(merganser::observation::KeyframeMessage::from(&keyframe)).unwrap();
+        change(&mut message);
+        std::fs::write(dir.path().join(name), message.to_string()).unwrap();
+        dir.path().join(name).to_str().unwrap().to_owned()
+    };
+    let (a, b) = (save(6, "a.json", &|_| {}), save(10, "b.json", &|_| {}));
+    let output = align(&[&a, &b, "--json"]);
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let truth = recording.truth().unwrap();
+    let error = (truth[6].pose.inverse() * truth[10].pose).local(&relation(&json(&output)).0);
+    assert!(error.fixed_rows::<3>(0).norm() < 0.05 && error.fixed_rows::<3>(3).norm() < 0.02, "{error}");
+    for (name, change, why) in [
+        (
+            "c.json",
+            (&|m: &mut Value| m["covariance"] = vec![1e-4; 36].into()) as &dyn Fn(&mut Value),
+            "covariance: 21 numbers",
+        ),
+        ("d.json", &|m| m["points"] = Value::Array(Vec::new()), "has no points"),
+    ] {
+        let bad = align(&[&a, &save(6, name, change)]);
+        let told = String::from_utf8_lossy(&bad.stderr).into_owned();
+        assert!(bad.status.code() == Some(2) && told.contains(name) && told.contains(why), "{told}");
+    }
+}

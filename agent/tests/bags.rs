@@ -80,3 +80,20 @@ fn an_agent_is_fed_what_a_bag_holds_of_its_robot() {
     let _ = agent.wait();
     assert!(fed.is_some_and(|line| line.contains("keyframes=60")), "{seen:#?}");
 }
+
+/// The submaps of a bag, as those of a recording; of several robots one is chosen by its topics.
+#[test]
+fn submaps_of_bags_are_read_as_those_of_recordings() {
+    let dir = tempfile::tempdir().unwrap();
+    save(dir.path(), "drive.bag", &[DRIVER]);
+    let output = merganser(&["align", "drive.bag:1", "drive.bag:1", "--json"], dir.path());
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{output:?}"));
+    // The world of these drives looks like itself, turned.
+    let seen = (&told["a"]["name"], &told["refused"]["reason"], output.status.code());
+    assert_eq!(seen, (&"drive.bag:1".into(), &"ambiguous".into(), Some(1)), "{told:#}");
+    assert!(told["a"]["keypoints"].as_u64().unwrap() > 100, "{told:#}");
+    let why = refused(&["align", "drive.bag:99", "drive.bag"], dir.path());
+    assert!(why.contains("drive.bag:99: there is no submap 99"), "{why}");
+    let why = refused(&["align", "drive.bag", "drive.bag", "--cloud", "/nothing"], dir.path());
+    assert!(why.contains("/nothing"), "{why}");
+}

@@ -315,3 +315,40 @@ fn what_does_not_converge_is_told_with_what_may_help() {
     }
     assert_eq!(graph(dir.path(), "solve bent.g2o").0, 0);
 }
+
+/// Once for each file that has them so, by its name; of the others nothing is told.
+#[test]
+fn quaternions_written_w_first_are_told_by_file_with_the_cure() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let of = |letter: u8| {
+        let way: String =
+            (0..14).map(|k| edge(robots_pose(letter, k), robots_pose(letter, k + 1), 1.0, "100")).collect();
+        way + &vertex(robots_pose(letter, 0), 7.0)
+    };
+    let w_first = |text: &str| text.replace(" 0 0 0 1 100 ", " 1 0 0 0 100 ");
+    std::fs::write(at.join("a.g2o"), of(b'a')).unwrap();
+    std::fs::write(at.join("b.g2o"), w_first(&of(b'b'))).unwrap();
+    let (_, _, odd) = graph(at, "solve a.g2o");
+    assert_eq!(odd, "");
+    let (_, _, odd) = graph(at, "solve a.g2o b.g2o");
+    assert_eq!(odd.matches("w first").count(), 1, "{odd}");
+    let told = "b.g2o: the quaternions of the EDGE_SE3:QUAT lines seem to be written w first; g2o has them as x y z w: put w last";
+    assert!(odd.contains(told), "{odd}");
+    // Values alone, of a robot that drives round.
+    let vertices = |w_first: bool| {
+        (0..40).fold(String::new(), |mut text, k| {
+            let half = 0.1 * f64::from(k);
+            let (s, c, turn) = (half.sin(), half.cos(), 2.0 * half);
+            let (x, y) = (5.0 * turn.sin(), 5.0 - 5.0 * turn.cos());
+            let q = if w_first { [c, 0.0, 0.0, s] } else { [0.0, 0.0, s, c] };
+            let _ = writeln!(text, "VERTEX_SE3:QUAT {k} {x} {y} 0 {} {} {} {}", q[0], q[1], q[2], q[3]);
+            text
+        })
+    };
+    for (is_w_first, count) in [(false, 0), (true, 1)] {
+        std::fs::write(at.join("c.g2o"), vertices(is_w_first)).unwrap();
+        let (_, _, odd) = graph(at, "solve c.g2o");
+        assert_eq!(odd.matches("c.g2o: the quaternions of the VERTEX_SE3:QUAT lines").count(), count, "{odd}");
+    }
+}

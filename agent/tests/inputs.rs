@@ -11,8 +11,8 @@
 //! | PCD with fields of `COUNT 0` | they have no bytes | [`fields_of_count_0_are_padding_without_bytes`] |
 //! | PCD with a `VIEWPOINT` | told that it is not applied | [`a_viewpoint_is_told`] |
 //! | JSON as Python sends it first | field, count, order, encoding | [`what_a_first_python_user_sends_is_told_with_the_cure`]; more of it: `observation_tests.rs` |
-//! | nine lost keyframes | the motion across is known to `gap_sigma_per_m` | [`whatever_loses_keyframes_leaves_the_body_as_uncertain`] |
-//! | a minute's standing at 10 Hz | one submap | [`a_robot_that_stands_for_a_minute_makes_one_submap_more`] |
+//! | nine lost keyframes | the motion across is known to `gap_sigma_per_m` | [`whatever_loses_keyframes_leaves_the_body_as_uncertain`]; by the agent's door: `lost_input.rs` |
+//! | a minute's standing at 10 Hz | one submap | [`a_robot_that_stands_for_a_minute_makes_one_submap_more`], [`a_robot_that_stands_for_a_night_costs_one_submap_and_no_try`] |
 //! | points in millimetres | told by extent and unit | [`points_in_millimetres_are_told`]; units of the rest: `doctor.rs` |
 //! | poses in map coordinates (UTM) | written by an offset, judged where robots are | `src/demo/far_tests.rs`: both tests |
 //! | input by the host's own address | one warning that names `zenoh.input_interfaces` | [`input_over_the_hosts_own_address_is_told_once_with_the_cure`]; that it is refused, whoever relays it: `door.rs` |
@@ -40,6 +40,7 @@ use std::fs;
 use std::net::UdpSocket;
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 /// Two robots with one keyframe each, of a cloud stored so, as `demo --data` reads them.
 fn two_robots(clouds: &str, cloud: &[u8]) -> (Vec<Recording>, tempfile::TempDir) {
@@ -92,7 +93,6 @@ fn a_bin_of_five_floats_is_read_as_such_and_told() {
 
 #[test]
 fn a_log_of_the_newer_laser_message_is_read() {
-    let (dir, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let mut log = String::from("PARAM robot_frontlaser_offset 0.0 nohost 0\n");
     for k in 0..60 {
         let x = 0.1 * f64::from(k);
@@ -102,17 +102,20 @@ fn a_log_of_the_newer_laser_message_is_read() {
         }
         let _ = writeln!(log, " 0 {x:.2} 0 0 {x:.2} 0 0 0 0 0 0 0 {}.0 robot {k}.0", 976_052_857 + k);
     }
-    fs::write(dir.path().join("new.clf"), log).unwrap();
-    let recordings = import::prepare(dir.path(), out.path(), 1).unwrap().recordings;
-    assert_eq!(recordings.len(), 3);
-    // Nineteen beams over half a turn, but those at their range: the first at the right, 10 m off.
-    let points = recordings[0].points(0).unwrap();
-    let first = points[0];
-    assert!(
-        (15..=19).contains(&points.len()) && first[1] < -9.0 && first[0].abs() < 0.01,
-        "{first:?} of {}",
-        points.len()
-    );
+    for name in ["new.clf", "new.log", "new.gfs.log"] {
+        let (dir, out) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        fs::write(dir.path().join(name), &log).unwrap();
+        let recordings = import::prepare(dir.path(), out.path(), 1).unwrap().recordings;
+        assert_eq!(recordings.len(), 3, "{name}");
+        // Nineteen beams over half a turn, but those at their range: the first at the right, 10 m off.
+        let points = recordings[0].points(0).unwrap();
+        let first = points[0];
+        assert!(
+            (15..=19).contains(&points.len()) && first[1] < -9.0 && first[0].abs() < 0.01,
+            "{first:?} of {}",
+            points.len()
+        );
+    }
 }
 
 #[test]
@@ -324,6 +327,39 @@ fn a_robot_that_stands_for_a_minute_makes_one_submap_more() {
     for hz in [1, 10, 100] {
         assert!((driven..=driven + 1).contains(&submaps(hz)), "{hz} Hz: {} instead of {driven}", submaps(hz));
     }
+}
+
+/// Eight hours at 10 Hz: one submap of it, and nothing is tried again.
+#[test]
+fn a_robot_that_stands_for_a_night_costs_one_submap_and_no_try() {
+    const TENTH: Duration = Duration::from_millis(100);
+    let alpha = built_in("alpha");
+    let mut core = ACore::new(alpha.manifest().config.clone());
+    let last = alpha.len() - 1;
+    for index in 0..alpha.len() {
+        core.input_after(TENTH * 8, Input::Keyframe(alpha.keyframe(index).unwrap()));
+    }
+    let mut still = alpha.keyframe(last).unwrap();
+    let (begun, at) = (still.stamp, still.pose.pose);
+    still.points.truncate(100);
+    still.pose.covariance = Covariance::from_sigmas([1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4]).unwrap();
+    let mut stand = |core: &mut ACore, tenths: core::ops::Range<i64>| {
+        for k in tenths {
+            // Odometry that trembles by 2 mm.
+            let off = Vector3::new(0.002 * (k % 3 - 1) as f64, 0.002 * (k % 2) as f64, 0.0);
+            still.stamp = Stamp(begun.0 + k * 100_000_000);
+            still.pose.pose = at * Se3::new(So3::identity(), off);
+            core.input_after(TENTH, Input::Keyframe(still.clone()));
+        }
+        let status = core.seen().status;
+        (status.submaps, status.keyframes, core.tried, core.jobs)
+    };
+    let driven = core.seen().status.submaps;
+    let (submaps, _, tried, jobs) = stand(&mut core, 1..600);
+    assert!((driven..=driven + 2).contains(&submaps), "{driven} submaps became {submaps} in a minute");
+    let night = stand(&mut core, 600..8 * 36_000);
+    assert_eq!(night, (submaps, alpha.len() as u64 + 8 * 36_000 - 1, tried, jobs), "submaps, keyframes, tries, jobs");
+    assert!(core.sigma_x() < 0.5, "{} m after a night at one place", core.sigma_x());
 }
 
 #[test]

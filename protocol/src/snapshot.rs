@@ -9,7 +9,7 @@ mod path;
 pub use path::{KeyframeView, PathView, bodies};
 
 use crate::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, SimWithCovariance};
-pub use crate::kinds::{Optimality, PairStatus};
+pub use crate::kinds::{Optimality, PairStatus, RefusalReason};
 use nalgebra::SMatrix;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -117,6 +117,50 @@ pub struct FramesView {
     /// Robots that may be wrong, and why.
     #[serde(default)]
     pub suspects: Vec<SuspectView>,
+    /// What this robot tried with frames of others since it started.
+    #[serde(default)]
+    pub tries: Vec<TriesView>,
+}
+
+/// Pairs of submaps, one of a frame of this robot and one of another robot's, that this robot tried to align.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TriesView {
+    /// The frame of this robot, `name/epoch`.
+    pub own: String,
+    /// The other robot's.
+    pub other: String,
+    /// Pairs that aligned.
+    pub found: u64,
+    /// Pairs that did not, by reason.
+    pub refused: BTreeMap<RefusalReason, u64>,
+}
+
+impl TriesView {
+    /// Pairs tried.
+    pub fn tried(&self) -> u64 {
+        self.found + self.refused.values().sum::<u64>()
+    }
+
+    /// The tries of both sides.
+    #[must_use]
+    pub fn and(mut self, other: &Self) -> Self {
+        self.found += other.found;
+        for (reason, count) in &other.refused {
+            *self.refused.entry(*reason).or_default() += count;
+        }
+        self
+    }
+
+    /// What became of pairs of which none aligned: how many there were, the commonest reason, and what may help. `None` if
+    /// some did, or there were none.
+    pub fn told(&self) -> Option<String> {
+        let (reason, count) =
+            self.refused.iter().max_by_key(|(reason, count)| (**count, std::cmp::Reverse(**reason)))?;
+        let [why, cure] = reason.explained();
+        let tried = self.tried();
+        let pairs = if tried == 1 { "pair of submaps was" } else { "pairs of submaps were" };
+        (self.found == 0).then(|| format!("{tried} {pairs} tried and none aligned, {count} since {why}: {cure}"))
+    }
 }
 
 /// A robot that may be wrong.

@@ -1,6 +1,6 @@
 //! LiDAR scans with known poses become robots: gtsam_points dumps, GLIM dumps, KITTI sequences, and numbered clouds
 //! beside a table of their poses. [`dump`] finds what a folder holds, and names what cannot be read; [`poses`] reads the
-//! tables; [`kitti`] tells a camera's poses from a LiDAR's.
+//! tables; [`kitti`] tells a camera's poses from a LiDAR's; [`times`] reads when scans were made.
 
 mod dump;
 mod glim;
@@ -8,6 +8,7 @@ mod kitti;
 mod poses;
 #[cfg(test)]
 mod tests;
+mod times;
 
 use super::cloud;
 use super::cut::{Cut, Scan};

@@ -46,6 +46,8 @@ pub use write::Writer;
 use crate::manifest::{FORMAT, KEYFRAMES_MAX, Manifest, UNIT_RANGE_M, VERSION};
 use error::on;
 use merganser_protocol::agent::io::PositionSighting;
+use merganser_protocol::geometry::Se3;
+use merganser_protocol::geometry::quaternion_order::QuaternionOrder;
 use merganser_protocol::submap::{Keyframe, Up};
 use merganser_protocol::time::Stamp;
 use merganser_protocol::wire::fact::ScaleKind;
@@ -126,7 +128,23 @@ impl Recording {
             let (_, odd) = self.remarked(index)?;
             remarks.note(&self.folder.join(&line.cloud), odd);
         }
+        for (table, told) in self.check_poses() {
+            remarks.note(&table, vec![told]);
+        }
         Ok(remarks)
+    }
+
+    /// The tables whose poses move as if their quaternions were written w first.
+    pub fn check_poses(&self) -> Vec<(PathBuf, Remark)> {
+        let doubted = |poses: &mut dyn Iterator<Item = Se3>| {
+            let mut order = QuaternionOrder::default();
+            poses.for_each(|pose| order.push(&pose));
+            order.is_doubtful()
+        };
+        let keyframes = doubted(&mut self.keyframes.iter().map(|line| line.pose.pose));
+        let truth = doubted(&mut self.truth.iter().flatten().map(|line| line.pose));
+        let tables = [(KEYFRAMES, keyframes), (TRUTH, truth)];
+        tables.into_iter().filter(|(_, odd)| *odd).map(|(name, _)| (self.folder.join(name), Remark::WFirst)).collect()
     }
 
     /// Where it lies.

@@ -286,7 +286,7 @@ pub fn position(format: Format, bytes: &[u8]) -> Result<PositionSighting, Observ
 
 fn decode<T: DeserializeOwned>(format: Format, bytes: &[u8]) -> Result<T, ObservationError> {
     match format {
-        Format::Json => serde_json::from_slice(bytes).map_err(|error| diagnose::json(bytes, &error)),
+        Format::Json => serde_json::from_slice(bytes).map_err(|error| diagnose::json::<T>(bytes, &error)),
         Format::Postcard => match postcard::take_from_bytes(bytes) {
             Ok((value, [])) => Ok(value),
             _ if diagnose::is_json(bytes) => Err(ObservationError::Encoding),

@@ -332,3 +332,78 @@ fn what_a_first_user_sends_is_told_by_field_count_and_order() {
     }
     assert!(matches!(keyframe(Format::Postcard, b"{1, 2}").unwrap_err(), ObservationError::Postcard(_)));
 }
+
+/// Every place of a value in a document, as the names and numbers that lead there.
+fn places(value: &serde_json::Value, at: &mut Vec<String>, out: &mut Vec<Vec<String>>) {
+    match value {
+        serde_json::Value::Object(fields) => {
+            for (name, value) in fields {
+                at.push(name.clone());
+                out.push(at.clone());
+                places(value, at, out);
+                at.pop();
+            }
+        }
+        serde_json::Value::Array(values) => {
+            for (k, value) in values.iter().enumerate() {
+                at.push(k.to_string());
+                out.push(at.clone());
+                places(value, at, out);
+                at.pop();
+            }
+        }
+        _ => {}
+    }
+}
+
+/// Whatever is wrong about a field, what is told names that field, and nothing else is blamed.
+#[test]
+fn what_is_told_names_the_very_field_that_is_wrong() {
+    use serde_json::{Value, json};
+    let up = UpMessage { direction: [0.0, 0.0, 1.0], sigma_rad: 0.02 };
+    let messages = [
+        serde_json::to_value(KeyframeMessage { up: Some(up), ..of_a_session() }).unwrap(),
+        serde_json::to_value(of_landmarks()).unwrap(),
+    ];
+    let bad = [
+        json!("soon"),
+        json!(-1e300),
+        json!(true),
+        json!({"k": 1}),
+        json!([[[1]]]),
+        json!(null),
+        json!([]),
+        json!(0.5),
+    ];
+    let mut refused = 0;
+    for message in &messages {
+        assert!(keyframe(Format::Json, message.to_string().as_bytes()).is_ok());
+        let mut all = Vec::new();
+        places(message, &mut Vec::new(), &mut all);
+        for (place, bad) in all.iter().flat_map(|place| bad.iter().map(move |bad| (place, bad))) {
+            let mut broken = message.clone();
+            let pointer = format!("/{}", place.join("/"));
+            *broken.pointer_mut(&pointer).unwrap() = bad.clone();
+            let Err(error) = keyframe(Format::Json, broken.to_string().as_bytes()) else { continue };
+            refused += 1;
+            let told = error.to_string();
+            // The name that leads there, or that of what it is part of.
+            let names: Vec<&str> =
+                place.iter().map(String::as_str).filter(|name| name.parse::<usize>().is_err()).collect();
+            let is_named = names.iter().any(|name| told.contains(name.trim_end_matches('s')));
+            assert!(is_named, "{pointer} = {bad}: {told}");
+        }
+        // One that is missing, if it must be there, and one that nobody knows.
+        for name in message.as_object().unwrap().keys() {
+            let mut without = message.clone();
+            without.as_object_mut().unwrap().remove(name);
+            if let Err(error) = keyframe(Format::Json, without.to_string().as_bytes()) {
+                assert!(error.to_string().contains(name.as_str()), "without {name}: {error}");
+            }
+        }
+        let mut more = message.clone();
+        more["velocity"] = Value::from(3);
+        assert!(keyframe(Format::Json, more.to_string().as_bytes()).unwrap_err().to_string().contains("velocity"));
+    }
+    assert!(refused > 300, "{refused}");
+}

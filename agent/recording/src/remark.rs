@@ -1,10 +1,10 @@
-//! What was odd in clouds and could be read all the same: told once a kind, by the first file in which it was.
+//! What was odd in clouds and tables and could be read all the same: told once a kind, by the first file in which it was.
 
 use core::fmt;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Something odd in one cloud.
+/// Something odd in one file.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Remark {
     /// A PCD states this `VIEWPOINT`.
@@ -13,6 +13,8 @@ pub enum Remark {
     Whole,
     /// A `.bin` of nuScenes, with a fifth number.
     Five,
+    /// Poses of a table move as if their quaternions were written w first.
+    WFirst,
 }
 
 impl fmt::Display for Remark {
@@ -30,6 +32,10 @@ impl fmt::Display for Remark {
             Self::Five => f.write_str(
                 "five numbers a point, the fifth the number of a laser: read as nuScenes' x y z intensity ring, not as \
                  KITTI's x y z reflectance",
+            ),
+            Self::WFirst => f.write_str(
+                "the body moves one way in its own axes only if the quaternions are written w first; they are read as x y z \
+                 w: put w last",
             ),
         }
     }
@@ -51,6 +57,7 @@ impl Remarks {
                 Remark::Viewpoint(_) => 0,
                 Remark::Whole => 1,
                 Remark::Five => 2,
+                Remark::WFirst => 3,
             };
             if !self.kinds.contains_key(&kind) {
                 news.push(format!("{}: {remark}", path.display()));

@@ -132,6 +132,8 @@ pub struct Pair {
     pub middle: Option<PoseError>,
     /// What the map itself says for and against it.
     pub certainty: Certainty,
+    /// What became of the pairs of submaps that both tried, if none aligned.
+    pub in_vain: Option<String>,
 }
 
 /// Errors of the single alignments between submaps that the joint estimate uses: whether their covariances are honest
@@ -259,9 +261,27 @@ fn pairs(tracks: &[Track], views: &[Views]) -> Vec<Pair> {
             }),
             middle: view.and_then(|view| middle(tracks, views, view)),
             certainty: Certainty::of(&views[0], &[&views[i], &views[j]].map(|views| views.frames.own.as_str())),
+            in_vain: if found.is_some() { None } else { Some(in_vain(&views[i], &views[j])) },
         });
     }
     pairs
+}
+
+/// What became of the tries of two robots that have nothing in common.
+fn in_vain(a: &Views, b: &Views) -> String {
+    let of = |own: &Views, other: &Views| {
+        let tries = own.frames.tries.iter().find(|tries| tries.other == other.frames.own);
+        tries.filter(|tries| tries.own == own.frames.own).cloned()
+    };
+    let both = [of(a, b), of(b, a)].into_iter().flatten().reduce(|one, other| one.and(&other));
+    let Some(tries) = both else {
+        return "no pair of submaps was tried: no two looked alike, or they have no keypoints; see what merganser doctor says \
+                of both"
+            .into();
+    };
+    let found =
+        || format!("{} pairs of submaps were tried and {} aligned, none of which counts", tries.tried(), tries.found);
+    tries.told().unwrap_or_else(found)
 }
 
 /// How the first bodies of both robots lie, by an estimate and by the truth of `t_a_b`. Both know where they began in

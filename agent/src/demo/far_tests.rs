@@ -1,7 +1,7 @@
 //! Frames whose origins are far from the robots, as of map coordinates (UTM): what is judged and written stays exact.
 
 use super::evaluate::{PoseError, between_starts};
-use super::outputs::{Cloud, merged_ply, offset_of};
+use super::outputs::{Cloud, merged_ply, offset_of, tum};
 use super::tests::tracks;
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Relative, Se3, Sim3, So3};
 use nalgebra::{Vector3, Vector6};
@@ -61,5 +61,22 @@ fn a_map_far_from_its_origin_is_written_relative_to_an_offset_that_is_stated() {
         };
         let written = Vector3::new(number(0), number(1), number(2)) + offset;
         assert!((written - want).amax() < 1e-4, "{written} {want}");
+    }
+}
+
+#[test]
+fn a_path_far_from_its_origin_is_written_to_the_micrometre() {
+    let at = |k: u32| {
+        let turn = So3::exp(&Vector3::new(0.01, -0.02, 0.1 * f64::from(k)));
+        let far = Vector3::new(399_512.123_456_7, 5_756_190.654_321_1, 48.000_001_4);
+        Sim3::from_se3(&Se3::new(turn, far + Vector3::new(0.001, 0.002, 0.003) * f64::from(k)))
+    };
+    let (poses, stamps): (Vec<Sim3>, Vec<f64>) = (0..40).map(|k| (at(k), 1_700_000_000.25 + f64::from(k))).unzip();
+    for (k, line) in tum(&stamps, &poses).lines().enumerate() {
+        let numbers: Vec<f64> = line.split(' ').map(|word| word.parse().unwrap()).collect();
+        let [secs, x, y, z, qx, qy, qz, qw] = numbers[..] else { panic!("{line}") };
+        let off = Vector3::new(x, y, z) - poses[k].translation;
+        let turned = So3::from_xyzw([qx, qy, qz, qw]).unwrap().local(&poses[k].rotation).norm();
+        assert!(off.amax() < 6e-7 && turned < 1e-8 && (secs - stamps[k]).abs() < 1e-6, "{line}: {off}, {turned}");
     }
 }

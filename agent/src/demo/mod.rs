@@ -22,6 +22,8 @@ mod far_tests;
 mod scale_tests;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod vain_tests;
 
 use crate::commands::topics::Topics;
 use crate::commands::{runtime, say};

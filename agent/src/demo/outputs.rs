@@ -150,7 +150,7 @@ pub(super) fn offset_of(clouds: &[Cloud]) -> Option<Vector3<f64>> {
 }
 
 /// The TUM format: `stamp x y z qx qy qz qw`, a pose a line.
-fn tum(stamps_secs: &[f64], poses: &[Sim3]) -> String {
+pub(super) fn tum(stamps_secs: &[f64], poses: &[Sim3]) -> String {
     let mut text = String::new();
     for (stamp, pose) in stamps_secs.iter().zip(poses) {
         let ([x, y, z], [qx, qy, qz, qw]) = (<[f64; 3]>::from(pose.translation), pose.rotation.xyzw());

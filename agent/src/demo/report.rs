@@ -90,6 +90,9 @@ fn alignment(text: &mut String, pair: &Pair) {
         "  {} {status}, {proposed} alignments proposed, {agreed} agreed, {used} used{nfa}",
         style(format!("{a} – {b}")).bold()
     );
+    if let Some(told) = &pair.in_vain {
+        let _ = writeln!(text, "    {told}");
+    }
     let Some(t) = &pair.t_a_b else { return };
     let sim = t.sim();
     let (p, r) = (sim.translation, sim.rotation.log().map(f64::to_degrees));

@@ -128,6 +128,7 @@ fn views(tracks: &[Track], own: usize, error: &Vector6<f64>) -> Views {
                 .collect(),
             pairs: vec![pair(0, 1), pair(0, 2), pair(1, 2)],
             suspects: Vec::new(),
+            tries: Vec::new(),
         },
         map: MapView { submaps: (0..3).flat_map(|r| (0..3).map(move |i| (r, i))).map(|(r, i)| submap(r, i)).collect() },
         path: path(tracks, own, |k| tracks[own].odometry[k]),

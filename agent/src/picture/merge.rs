@@ -328,6 +328,30 @@ mod tests {
         Scene { title, subtitle, up: Vector3::z(), robots, alignments, in_metres: true }
     }
 
+    fn pixels(scene: &Scene) -> Vec<u8> {
+        let bytes = png(&draw(scene), 1.0).unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut pixels).unwrap();
+        pixels
+    }
+
+    /// As of map coordinates (UTM), where single precision would blur everything into half a metre.
+    #[test]
+    fn a_scene_far_from_its_origin_is_the_same_picture() {
+        let mut far = scene();
+        let offset = Vector3::new(399_512.25, 5_756_190.5, 48.0);
+        for robot in &mut far.robots {
+            let Robot { alone, merged, truth, anchors, .. } = robot;
+            let points = [&mut alone.0, &mut alone.1, &mut merged.0, &mut merged.1, truth].into_iter().flatten();
+            points.chain(anchors.iter_mut().map(|(at, _)| at)).for_each(|at| *at += offset);
+        }
+        far.alignments.iter_mut().flatten().for_each(|at| *at += offset);
+        let (near, far) = (pixels(&scene()), pixels(&far));
+        let differ = near.iter().zip(&far).filter(|(a, b)| a.abs_diff(**b) > 12).count();
+        assert!(near.len() == far.len() && differ * 200 < near.len(), "{differ} of {}", near.len());
+    }
+
     #[test]
     fn a_scene_renders_with_every_colour_and_text() {
         let svg = draw(&scene());

@@ -17,6 +17,9 @@ const POINTS: usize = 12_000;
 pub(super) fn plan(points: &[Vector3<f64>], up: &Vector3<f64>) -> Matrix2x3<f64> {
     let step = points.len().div_ceil(POINTS).max(1);
     let sample: Vec<Vector3<f64>> = points.iter().step_by(step).copied().collect();
+    // Cells are as large as the map, wherever its frame's origin is.
+    let middle = sample.iter().sum::<Vector3<f64>>() / (sample.len().max(1) as f64);
+    let sample: Vec<Vector3<f64>> = sample.into_iter().map(|p| p - middle).collect();
     let sight = sight(&sample, &up.normalize());
     let [u, v] = basis(&sight);
     let flat = Matrix2x3::from_rows(&[u.transpose(), v.transpose()]);

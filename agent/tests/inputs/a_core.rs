@@ -1,7 +1,7 @@
 //! A core alone, whose jobs are run and whose records are durable at once.
 
 use merganser::trust::SecretKey;
-use merganser_protocol::agent::io::{Input, Output};
+use merganser_protocol::agent::io::{Event, Input, Output};
 use merganser_protocol::agent::{Agent, Identity};
 use merganser_protocol::config::Config;
 use merganser_protocol::ids::Name;
@@ -14,6 +14,10 @@ use std::time::Duration;
 pub struct ACore {
     agent: Agent,
     now: Instant,
+    /// Pairs of submaps that were tried.
+    pub tried: usize,
+    /// Jobs that were run.
+    pub jobs: usize,
 }
 
 impl ACore {
@@ -22,18 +26,27 @@ impl ACore {
         let roster = [(name.clone(), key.public().to_bytes())].into();
         let identity = Identity { swarm: Name::new("test").unwrap(), name, secret_key: *key.to_bytes(), roster };
         let agent = Agent::new(config, identity, 1, Default::default(), Instant::ZERO).unwrap();
-        Self { agent, now: Instant::ZERO }
+        Self { agent, now: Instant::ZERO, tried: 0, jobs: 0 }
     }
 
     /// A second passes, then this comes, and is all worked off.
     pub fn input(&mut self, input: Input) {
-        self.now = self.now.after(Duration::from_secs(1));
+        self.input_after(Duration::from_secs(1), input);
+    }
+
+    /// The same after another time.
+    pub fn input_after(&mut self, passed: Duration, input: Input) {
+        self.now = self.now.after(passed);
         let mut inbox = VecDeque::from([Input::Timeout, input]);
         while let Some(input) = inbox.pop_front() {
             self.agent.handle(self.now, input);
             while let Some(output) = self.agent.poll_output() {
                 match output {
-                    Output::Run { id, job } => inbox.push_back(Input::JobDone { job: id, result: job.run() }),
+                    Output::Run { id, job } => {
+                        self.jobs += 1;
+                        inbox.push_back(Input::JobDone { job: id, result: job.run() });
+                    }
+                    Output::Event(Event::AlignmentTried { .. } | Event::LookedAgain { .. }) => self.tried += 1,
                     Output::Persist { batch, .. } => inbox.push_back(Input::Persisted { up_to: batch }),
                     _ => {}
                 }
@@ -52,7 +65,7 @@ impl ACore {
         self.seen().status.gaps
     }
 
-    fn seen(&self) -> Snapshot {
+    pub fn seen(&self) -> Snapshot {
         self.agent.snapshot(self.now)
     }
 }

@@ -32,6 +32,7 @@ pub mod gaussian;
 pub mod group;
 #[cfg(test)]
 mod laws;
+pub mod quaternion_order;
 pub mod relative;
 pub mod sampling;
 pub mod se2;

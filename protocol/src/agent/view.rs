@@ -15,7 +15,7 @@ use crate::geometry::Se3;
 use crate::ids::{EntryId, FrameId, RobotId};
 use crate::snapshot::{
     CondensedView, EdgeView, FailedView, FrameView, FramesView, GraphView, MapView, MiddleView, PairView, PathView,
-    PoseView, PosesView, RelationView, Snapshot, StatsView, StatusView, SubmapView, SuspectView,
+    PoseView, PosesView, RelationView, Snapshot, StatsView, StatusView, SubmapView, SuspectView, TriesView,
 };
 use crate::time::Instant;
 use crate::wire::fact::AlignmentFact;
@@ -115,7 +115,24 @@ impl Agent {
                 t_own_frame: self.estimation.t_own_frame(own, frame).as_ref().map(RelationView::from),
             })
             .collect();
-        FramesView { own: self.context.frame_name(own), frames, pairs: self.pair_views(), suspects: self.suspects() }
+        FramesView {
+            own: self.context.frame_name(own),
+            frames,
+            pairs: self.pair_views(),
+            suspects: self.suspects(),
+            tries: self.tries(),
+        }
+    }
+
+    fn tries(&self) -> Vec<TriesView> {
+        let all = self.alignment.tries().iter();
+        all.map(|(own, other, outcomes)| TriesView {
+            own: self.context.frame_name(own),
+            other: self.context.frame_name(other),
+            found: outcomes.found,
+            refused: outcomes.refused.clone(),
+        })
+        .collect()
     }
 
     /// Numbers the components by their smallest frames; frames with one number are connected.

@@ -142,6 +142,16 @@ fn strangers(config: &Config) -> Wires {
     wires
 }
 
+/// What was tried in vain is told by frame, count and reason.
+fn tells_why(wires: &Wires) {
+    let seen = wires.agents[0].snapshot(wires.now);
+    let [tries] = &seen.frames.tries[..] else { panic!("{:?}", seen.frames.tries) };
+    assert_eq!((tries.found, tries.tried() as usize), (0, tried(wires).len()), "{tries:?}");
+    let told = tries.told().unwrap();
+    assert!(tries.other.starts_with("beta/") && told.contains("tried and none aligned"), "{told}");
+    assert!(seen.frames.pairs.is_empty());
+}
+
 /// The two start again.
 fn again(config: &Config, disks: &[Vec<Record>]) -> Wires {
     let mut wires = Wires::new((0..2).map(|k| started(k, config, disks[k].clone())).collect());
@@ -174,6 +184,7 @@ fn in_common(a: &[Pair], b: &[Pair]) -> usize {
 #[test]
 fn a_refused_pair_is_not_tried_again_after_a_restart() {
     let mut first = strangers(&config());
+    tells_why(&first);
     let before = tried(&first);
     assert!(before.len() > REFUSED_WAITING_MAX, "{}", before.len());
     // A kill now loses a few of them, but no more.

@@ -32,6 +32,40 @@ pub enum RefusalReason {
     BadInput,
 }
 
+impl RefusalReason {
+    /// In words: why, and what may help.
+    pub fn explained(self) -> [&'static str; 2] {
+        match self {
+            Self::TooFew => [
+                "too few keypoints match",
+                "see in the log how many keypoints submaps have, and that all robots state the same submap.sensor and voxel_m",
+            ],
+            Self::NoConsensus => [
+                "nothing fits better than chance",
+                "they may have seen no common place yet; if they have, see that all robots state the same submap.sensor and \
+                 voxel_m, and that merganser doctor finds nothing odd about either",
+            ],
+            Self::Ambiguous => [
+                "they fit in several ways",
+                "the place repeats itself: let submaps reach farther (submap.distance_m), or drive on",
+            ],
+            Self::Degenerate => [
+                "the geometry leaves a direction open, as in a corridor",
+                "let submaps reach farther (submap.distance_m), or drive on",
+            ],
+            Self::PoorFit => [
+                "what would fit contradicts what else the two saw",
+                "see by merganser doctor whether poses and points are as they are to be, and whether things moved",
+            ],
+            Self::BadInput => [
+                "there are too few keypoints, or they cannot be read",
+                "see in the log how many keypoints submaps have, and that all robots state the same submap.sensor and voxel_m \
+                 and run one version",
+            ],
+        }
+    }
+}
+
 /// What is known about a pair of frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

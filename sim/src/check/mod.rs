@@ -228,6 +228,7 @@ pub(crate) mod tests {
             frames: frames.iter().map(frame).collect(),
             pairs: Vec::new(),
             suspects: Vec::new(),
+            tries: Vec::new(),
         };
         let snapshot = Snapshot {
             status,

@@ -2,7 +2,7 @@
 //! instead.
 
 use super::poses::Poses;
-use super::{glim, kitti};
+use super::{glim, kitti, times};
 use crate::error::{Problem, RecordingError, on};
 use crate::manifest::CloudFormat;
 use merganser_protocol::geometry::Se3;
@@ -121,7 +121,8 @@ impl Dump {
             frames.push(Frame { number, stamp: Some(stamp), pose, source: folder.join(glim::POINTS) });
         }
         let told = "GLIM's submaps: each is a cloud of several scans, put together as seen from the middle one, by poses \
-                    that its loops have already corrected; a bag of its odometry and scans is truer";
+                    that its loops have already corrected: what lies before a point counts as seen to be free, which \
+                    refuses some pairs; a bag of its odometry and scans is truer";
         let (format, stated) = (CloudFormat::XyzBin, frames.len());
         Ok(Self { format, frames, stated, remarks: vec![told.into()], is_submaps: true, are_turns: false })
     }
@@ -132,8 +133,10 @@ impl Dump {
         let path = data.join(GRAPH);
         let mut poses = Poses::read(&path)?;
         let stated = poses.len();
-        let remarks = kitti::of_lidar(data, &path, &mut poses)?;
+        let mut remarks: Vec<String> = poses.order_told().into_iter().collect();
+        remarks.extend(kitti::of_lidar(data, &path, &mut poses)?);
         let frames = poses.join(data, scans)?;
+        remarks.extend(missing(&frames));
         Ok(Self { format: CloudFormat::XyzBin, frames, stated, remarks, is_submaps: false, are_turns: false })
     }
 
@@ -162,12 +165,32 @@ impl Dump {
             };
             let mut poses = Poses::read(&path)?;
             let stated = poses.len();
-            let remarks = [remarks, kitti::of_lidar(data, &path, &mut poses)?].concat();
-            let frames = poses.join(data, by_number)?;
+            let order = poses.order_told().into_iter().collect();
+            let mut remarks = [remarks, order, kitti::of_lidar(data, &path, &mut poses)?].concat();
+            let mut frames = poses.join(data, by_number)?;
+            remarks.extend(missing(&frames));
+            times::give(data, &mut frames)?;
             return Ok(Self { format, frames, stated, remarks, is_submaps: false, are_turns: true });
         }
         Err(Problem::Data(format!("holds no scans NNNNNN{SCAN_SUFFIX}, NNNNNN.pcd or NNNNNN.ply")).of(data))
     }
+}
+
+/// Says which scans are missing: numbers that the others' usual step leaves out. A thinned sequence has a larger step.
+fn missing(frames: &[Frame]) -> Option<String> {
+    let steps: Vec<u64> = frames.windows(2).map(|two| two[1].number - two[0].number).collect();
+    let mut sorted = steps.clone();
+    sorted.sort_unstable();
+    let usual = *sorted.get(sorted.len() / 2)?;
+    let are_counted = 2 * steps.iter().filter(|step| **step == usual).count() > steps.len();
+    let gaps: Vec<(usize, u64)> = steps.iter().copied().enumerate().filter(|(_, step)| *step > usual).collect();
+    let (after, _) = *gaps.first().filter(|_| are_counted)?;
+    let count: u64 = gaps.iter().map(|(_, step)| step.div_ceil(usual) - 1).sum();
+    let (first, s) = (frames[after].number + usual, if count == 1 { " is" } else { "s are" });
+    Some(format!(
+        "{count} scan{s} missing between the others, the first {first:06}: the motion across is longer, and its error taken to \
+         grow with the way"
+    ))
 }
 
 /// The table of poses in a folder; KITTI's lies where the set keeps it, too.

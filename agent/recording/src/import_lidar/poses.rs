@@ -6,8 +6,10 @@ use super::dump::Frame;
 use crate::bounded::read_text;
 use crate::error::{Problem, RecordingError};
 use crate::import_rgbd::rigid;
+use crate::remark::Remark;
 use crate::table::{number, pose_of};
 use merganser_protocol::geometry::Se3;
+use merganser_protocol::geometry::quaternion_order::QuaternionOrder;
 use merganser_protocol::time::Stamp;
 use nalgebra::Matrix4;
 use std::collections::BTreeMap;
@@ -61,6 +63,15 @@ impl Poses {
     /// All poses, in the order of the lines.
     pub fn poses(&self) -> impl Iterator<Item = &Se3> {
         self.rows.iter().map(|(_, pose, _)| pose)
+    }
+
+    /// What is told if the body moves as if quaternions were written w first.
+    pub fn order_told(&self) -> Option<String> {
+        let mut order = QuaternionOrder::default();
+        let of_quaternions = self.rows.iter().filter(|(key, ..)| !matches!(key, Key::Line));
+        of_quaternions.for_each(|(_, pose, _)| order.push(pose));
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        order.is_doubtful().then(|| format!("{name}: {}", Remark::WFirst))
     }
 
     /// Changes each pose.

@@ -329,3 +329,134 @@ fn nuscenes_scans_are_read_by_number_and_named_by_their_own_names() {
     });
     assert!(told.len() == 1 && told[0].contains("five numbers a point"), "{told:?}");
 }
+
+/// As a table is that a program wrote whose quaternions have w first.
+fn w_first(poses: &[Se3], key: impl Fn(usize) -> String) -> String {
+    poses.iter().enumerate().fold(String::new(), |mut text, (k, pose)| {
+        let ([x, y, z, w], t) = (pose.rotation.xyzw(), pose.translation);
+        let _ = writeln!(text, "{} {} {} {} {w} {x} {y} {z}", key(k), t.x, t.y, t.z);
+        text
+    })
+}
+
+/// A way of so many scans, in an arc.
+fn long(scans: usize) -> Vec<Se3> {
+    let step = Se3::new(So3::exp(&Vector3::new(0.0, 0.002, 0.15)), Vector3::new(1.0, 0.02, 0.01));
+    (0..scans).scan(Se3::identity(), |at, _| Some(std::mem::replace(at, *at * step))).collect()
+}
+
+#[test]
+fn quaternions_that_are_written_w_first_are_told_once_and_others_are_not() {
+    let poses = long(30);
+    let write = |table: String, name: &'static str| {
+        move |d: &Path| {
+            for k in 0..30 {
+                let bytes = floats(points(k).iter().flat_map(|at| [at[0], at[1], at[2], 0.5]));
+                fs::write(d.join(format!("{k:06}.bin")), bytes).unwrap();
+            }
+            fs::write(d.join(name), table).unwrap();
+        }
+    };
+    for key in [|k: usize| k.to_string(), |k: usize| format!("{}.5", 100 + k)] {
+        let (right, _out) = prepared(write(table(&poses, key), "poses.txt"));
+        assert_eq!(right.unwrap().remarks, Vec::<String>::new());
+        let (wrong, _out) = prepared(write(w_first(&poses, key), "optimized_poses.txt"));
+        let told = wrong.unwrap().remarks;
+        let order: Vec<&String> = told.iter().filter(|told| told.contains("written w first")).collect();
+        assert!(
+            order.len() == 1 && order[0].starts_with("optimized_poses.txt: ") && order[0].contains("put w last"),
+            "{told:?}"
+        );
+    }
+}
+
+#[test]
+fn the_times_of_a_sequence_are_read() {
+    let truth = way(1.0);
+    let with = |times: String, every: usize| {
+        let truth = truth.clone();
+        move |d: &Path| {
+            bins(d, every);
+            fs::write(d.join("poses.txt"), rows(&truth)).unwrap();
+            fs::write(d.join("times.txt"), times).unwrap();
+        }
+    };
+    // As KITTI writes them: uneven, with an exponent.
+    let secs = |k: usize| 0.1037 * k as f64 + 1e-3 * (k % 3) as f64;
+    let times: String = (0..SCANS).map(|k| format!("{:e}\n", secs(k))).collect();
+    for every in [1, 2] {
+        let (prepared, _out) = prepared(with(times.clone(), every));
+        let mut at = (0..SCANS).step_by(every);
+        for line in prepared.unwrap().recordings.iter().flat_map(|recording| recording.keyframes().to_vec()) {
+            let off = line.stamp.0 as f64 * 1e-9 - secs(at.next().unwrap());
+            assert!(off.abs() < 1e-8, "{off} s");
+        }
+        assert_eq!(at.next(), None);
+    }
+    let (file, line, text) = bad(with("0.0\n0.1\n0.1\n".repeat(5), 1));
+    assert!(file == "times.txt" && line == Some(3), "{text}");
+    let (file, line, text) = bad(with("0.0\n1e-1\nsoon\n".repeat(5), 1));
+    assert!(file == "times.txt" && line == Some(3) && text.contains("soon"), "{text}");
+    let (file, _, text) = bad(with("0.0\n0.1\n".into(), 1));
+    assert!(
+        file == "times.txt" && text.contains("no time of scan 000002") && text.contains("take times.txt away"),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_scan_that_is_missing_between_others_is_told_and_a_thinned_sequence_is_none() {
+    let truth = way(1.0);
+    let told = |every: usize, without: &[usize]| {
+        let (prepared, _out) = prepared(|d| {
+            bins(d, every);
+            fs::write(d.join("poses.txt"), rows(&truth)).unwrap();
+            without.iter().for_each(|k| fs::remove_file(d.join(format!("{k:06}.bin"))).unwrap());
+        });
+        prepared.unwrap().remarks
+    };
+    assert_eq!([told(1, &[]), told(2, &[])], [vec![], Vec::<String>::new()]);
+    let one = told(1, &[7]);
+    assert!(one.len() == 1 && one[0].contains("1 scan is missing between the others, the first 000007"), "{one:?}");
+    let more = told(1, &[3, 8, 9]);
+    assert!(
+        more.len() == 1 && more[0].contains("3 scans are missing between the others, the first 000003"),
+        "{more:?}"
+    );
+    let thinned = told(2, &[4]);
+    assert!(
+        thinned.len() == 1 && thinned[0].contains("1 scan is missing between the others, the first 000004"),
+        "{thinned:?}"
+    );
+}
+
+/// In a recording's own tables, too: each is named once, by `demo`, before anything is fed.
+#[test]
+fn tables_of_a_recording_with_w_first_are_named() {
+    let poses = long(90);
+    let (made, _out) = prepared(|d| {
+        for k in 0..poses.len() {
+            let bytes = floats(points(k % 7).iter().flat_map(|at| [at[0], at[1], at[2], 0.5]));
+            fs::write(d.join(format!("{k:06}.bin")), bytes).unwrap();
+        }
+        fs::write(d.join("poses.txt"), table(&poses, |k| k.to_string())).unwrap();
+    });
+    let recording = made.unwrap().recordings.remove(0);
+    let told = |recording: &Recording| recording.check_clouds().unwrap().told();
+    assert_eq!(told(&recording), Vec::<String>::new());
+    let folder = recording.folder();
+    for name in ["keyframes.csv", "truth.csv"] {
+        let text = fs::read_to_string(folder.join(name)).unwrap();
+        let turned = text.lines().enumerate().map(|(number, line)| {
+            let mut fields: Vec<&str> = line.split(',').collect();
+            if number > 0 {
+                fields[4..8].rotate_right(1);
+            }
+            fields.join(",") + "\n"
+        });
+        fs::write(folder.join(name), turned.collect::<String>()).unwrap();
+        let told = told(&Recording::open(folder).unwrap());
+        assert!(told.len() == 1 && told[0].contains("written w first") && told[0].contains("put w last"), "{told:?}");
+        assert!(told[0].contains("keyframes.csv"), "the first that is so: {told:?}");
+    }
+}

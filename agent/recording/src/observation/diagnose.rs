@@ -2,6 +2,7 @@
 //! and in which order, and how to send them. Looked at only after the strict reader has refused it.
 
 use super::ObservationError;
+use serde::de::{DeserializeOwned, IgnoredAny};
 use serde_json::Value;
 
 /// Numbers of a field, and their order.
@@ -24,10 +25,22 @@ const FIELDS: [Wanted; 4] = [
     Wanted { name: "covariance", count: 21, order: TRIANGLE },
 ];
 
-/// Why JSON is no keyframe, sighting or position.
-pub(super) fn json(bytes: &[u8], error: &serde_json::Error) -> ObservationError {
-    let told = told(bytes).unwrap_or_else(|| error.to_string());
+/// Why JSON is no `T`: a keyframe, sighting or position.
+pub(super) fn json<T: DeserializeOwned>(bytes: &[u8], error: &serde_json::Error) -> ObservationError {
+    let told = told(bytes).unwrap_or_else(|| named::<T>(bytes, error));
     ObservationError::Json(one_line(&told))
+}
+
+/// The error, with the field that it is of before it.
+fn named<T: DeserializeOwned>(bytes: &[u8], error: &serde_json::Error) -> String {
+    let mut reader = serde_json::Deserializer::from_slice(bytes);
+    let field = serde_path_to_error::deserialize::<_, T>(&mut reader).err().map(|error| error.path().to_string());
+    // A text that is no JSON has no fields.
+    let is_json = serde_json::from_slice::<IgnoredAny>(bytes).is_ok();
+    match field.filter(|field| is_json && field != ".") {
+        Some(field) => format!("{field}: {error}"),
+        None => error.to_string(),
+    }
 }
 
 /// Names of fields are the sender's: what is told of them is one line, and not as long as they like. Of a longer one the

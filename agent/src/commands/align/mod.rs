@@ -5,6 +5,7 @@ mod report;
 mod side;
 
 use super::BadInput;
+use super::topics::Topics;
 use crate::picture;
 use anyhow::{Context, Result};
 use merganser_protocol::agent::job::{AlignJob, Measured, Refused};
@@ -17,9 +18,11 @@ use std::path::PathBuf;
 
 /// What `merganser align` can be told.
 #[derive(Clone, Debug, clap::Args)]
-#[command(after_help = "A and B are clouds (.ply, .pcd, .bin), points in the sensor's or body's frame, or submaps of \
-                        recordings: FOLDER, or FOLDER:7 for its eighth. t_a_b maps coordinates in B into A.\n\
-                        Exit codes: 0 aligned, 1 not, 2 the command line or a file is wrong.")]
+#[command(
+    after_help = "A and B are clouds (.ply, .pcd, .bin) or keyframes as messages (.json), points in the sensor's or \
+                        body's frame, or submaps of recordings and ROS bags: FOLDER, or FOLDER:7 for its eighth. t_a_b maps coordinates in B into A.\n\
+                        Exit codes: 0 aligned, 1 not, 2 the command line or a file is wrong."
+)]
 pub struct AlignArgs {
     /// The one.
     pub a: PathBuf,
@@ -46,6 +49,9 @@ pub struct AlignArgs {
     /// How clouds are stored, if their names do not tell: ply, pcd, kitti-bin or xyz-bin.
     #[arg(long, value_name = "FORMAT", value_parser = format)]
     pub format: Option<CloudFormat>,
+    /// Topics of bags.
+    #[command(flatten)]
+    pub topics: Topics,
     /// Seed of the sampler.
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub seed: u64,

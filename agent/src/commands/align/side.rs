@@ -2,7 +2,9 @@
 
 use super::AlignArgs;
 use crate::commands::BadInput;
-use crate::recording::{Recording, cloud};
+use crate::commands::scratch::Scratch;
+use crate::observation::{self, Format};
+use crate::recording::{Recording, cloud, import};
 use anyhow::Result;
 use merganser_protocol::config::{Config, Sensor};
 use merganser_protocol::geometry::{Covariance, PoseWithCovariance, Se3};
@@ -30,10 +32,15 @@ const CELL_M: f64 = 0.25;
 /// Standard deviation of the one pose of a cloud, which is where it is by definition.
 const POSE_SIGMA: f64 = 1e-4;
 
+/// Bytes of a message at most: the largest that an agent can be told to take.
+const MESSAGE_BYTES_MAX: u64 = 16 << 20;
+
 /// What was read.
 pub(super) struct Source {
     name: String,
     what: What,
+    /// What a bag was made into.
+    _scratch: Option<Scratch>,
 }
 
 enum What {
@@ -59,9 +66,15 @@ pub(super) struct Side {
 pub(super) fn read(path: &Path, args: &AlignArgs) -> Result<Source> {
     let name = path.display().to_string();
     let (folder, number) = numbered(path);
+    if import::is_bag(&folder) {
+        return of_bag(name, &folder, number, args);
+    }
     if folder.is_dir() {
         let recording = Recording::open(&folder)?;
-        return Ok(Source { name, what: What::Recording(Box::new(recording), number) });
+        return Ok(Source { name, what: What::Recording(Box::new(recording), number), _scratch: None });
+    }
+    if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json")) {
+        return of_message(name, path);
     }
     let format = args.format.map_or_else(|| format_of(path), Ok)?;
     let (points, remarks) = cloud::read_remarked(path, format)?;
@@ -70,7 +83,41 @@ pub(super) fn read(path: &Path, args: &AlignArgs) -> Result<Source> {
     }
     let sees_landmarks = args.sensor.is_some_and(Sensor::sees_landmarks);
     let marks = if sees_landmarks { cloud::landmarks(path, format)? } else { Vec::new() };
-    Ok(Source { name, what: What::Cloud(points, marks) })
+    Ok(Source { name, what: What::Cloud(points, marks), _scratch: None })
+}
+
+/// What a bag holds of its one robot.
+fn of_bag(name: String, bag: &Path, number: usize, args: &AlignArgs) -> Result<Source> {
+    let scratch = Scratch::new("align")?;
+    let mut prepared = import::prepare_bag(bag, scratch.path(), &args.topics.wanted())?;
+    for remark in prepared.remarks {
+        console::Term::stderr().write_line(&format!("merganser: {name}: {remark}"))?;
+    }
+    if prepared.recordings.len() > 1 {
+        let robots: Vec<&str> = prepared.recordings.iter().map(|one| one.manifest().robot.as_str()).collect();
+        return Err(BadInput::told(format!(
+            "{name}: holds the robots {}: choose one by its topics, --odometry /NAME/… --cloud /NAME/…",
+            robots.join(", ")
+        )));
+    }
+    let recording = prepared.recordings.remove(0);
+    Ok(Source { name, what: What::Recording(Box::new(recording), number), _scratch: Some(scratch) })
+}
+
+/// The points of a keyframe, as a SLAM sends it in JSON.
+fn of_message(name: String, path: &Path) -> Result<Source> {
+    let told = |why: String| BadInput::told(format!("{name}: {why}"));
+    let bytes = match std::fs::metadata(path) {
+        Ok(file) if file.len() > MESSAGE_BYTES_MAX => {
+            return Err(told(format!("has more than {MESSAGE_BYTES_MAX} bytes, which no agent takes in one message")));
+        }
+        _ => std::fs::read(path).map_err(|error| told(error.to_string()))?,
+    };
+    let keyframe = observation::keyframe(Format::Json, &bytes).map_err(|error| told(error.to_string()))?;
+    if keyframe.points.is_empty() {
+        return Err(told("has no points".into()));
+    }
+    Ok(Source { name: name.clone(), what: What::Cloud(keyframe.points, keyframe.marks), _scratch: None })
 }
 
 /// A folder, and which of its submaps, if it is named so.
@@ -90,7 +137,8 @@ fn format_of(path: &Path) -> Result<CloudFormat> {
         "pcd" => Ok(CloudFormat::Pcd),
         "bin" => Ok(CloudFormat::KittiBin),
         _ => Err(BadInput::told(format!(
-            "{}: its name does not end in .ply, .pcd or .bin, and it is no folder; say by --format how it is stored",
+            "{}: its name does not end in .ply, .pcd, .bin or .json, and it is no folder and no bag; say by --format how \
+             it is stored",
             path.display()
         ))),
     }

@@ -1,5 +1,6 @@
 //! Keyframes put through what an agent puts them through, and counted.
 
+use super::clock;
 use ed25519_dalek::SigningKey;
 use merganser_protocol::agent::job::{AlignJob, Measured, Refused};
 use merganser_protocol::agent::stated;
@@ -38,6 +39,8 @@ pub struct Examined {
     pub keyframes: usize,
     /// From the first of them to the last, by their stamps, s.
     pub secs: f64,
+    /// What clock their stamps are of; empty without keyframes.
+    pub clock: String,
     /// Why others were not, and how many.
     pub refused: BTreeMap<String, u64>,
     /// Points of a keyframe, median.
@@ -72,6 +75,8 @@ pub struct Examination {
     habits: Habits,
     submaps: Vec<Submap>,
     stamps: Option<[Stamp; 2]>,
+    /// What this host's clock showed when the first keyframe came.
+    host: Option<Stamp>,
     last: Option<Se3>,
     keyframes: usize,
     refused: BTreeMap<String, u64>,
@@ -92,6 +97,7 @@ impl Examination {
             habits: Habits::default(),
             submaps: Vec::new(),
             stamps: None,
+            host: None,
             last: None,
             keyframes: 0,
             refused: BTreeMap::new(),
@@ -103,6 +109,11 @@ impl Examination {
         }
     }
 
+    /// The first keyframe came when this host's clock showed this.
+    pub fn came(&mut self, host: Stamp) {
+        self.host = Some(host);
+    }
+
     /// Something came that was no keyframe.
     pub fn refuse(&mut self, reason: String, count: u64) {
         *self.refused.entry(reason).or_default() += count;
@@ -111,6 +122,11 @@ impl Examination {
     /// What is odd so far.
     pub fn remarks(&self) -> &[String] {
         &self.remarks
+    }
+
+    /// Submaps that are closed.
+    pub fn submaps(&self) -> usize {
+        self.submaps.len()
     }
 
     /// Whether more would change nothing.
@@ -191,6 +207,11 @@ impl Examination {
                 "nothing that could be used was sent: is the SLAM connected to this endpoint, and does it publish {key}?"
             ));
         }
+        let clock = self.stamps.map_or(clock::Told::default(), |[first, _]| clock::told(first, self.host));
+        // The rate of stamps tells it, too, of many keyframes.
+        if clock.is_other_unit && !self.remarks.iter().any(|told| told.contains("stamps rise as if")) {
+            self.remarks.push(clock.text.clone());
+        }
         for (reason, count) in &self.refused {
             self.remarks.push(format!("refused {count} times: {reason}"));
         }
@@ -211,6 +232,7 @@ impl Examination {
             voxel_m: self.config.submap.voxel_m,
             keyframes: self.keyframes,
             secs,
+            clock: clock.text,
             refused: self.refused,
             points: median(self.points).unwrap_or_default(),
             reach_m: [share(0.5), share(0.9)],

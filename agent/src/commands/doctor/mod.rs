@@ -1,6 +1,7 @@
 //! `merganser doctor`: looks at keyframes as an agent does, before there is a swarm: those of recordings or of a data set,
 //! or what a running SLAM sends. It tells what it sees and what to change.
 
+mod clock;
 mod examine;
 mod report;
 
@@ -14,9 +15,9 @@ use crate::recording::Recording;
 use crate::recording::import;
 use anyhow::Result;
 pub use examine::{Examination, Examined};
-use merganser_protocol::time::Instant;
+use merganser_protocol::time::{Instant, Stamp};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 /// What `merganser doctor` can be told.
 #[derive(Clone, Debug, clap::Args)]
@@ -94,6 +95,11 @@ fn listen(config: &FileConfig, secs: f64) -> Result<Examined> {
     let mut examination = Examination::new(config.robot.to_string(), config.core.clone());
     heard.refused.into_iter().for_each(|(reason, count)| examination.refuse(reason, count));
     let first = heard.keyframes.first().map(|(at, _)| *at);
+    let came = first
+        .and_then(|first| SystemTime::now().checked_sub(first.elapsed())?.duration_since(SystemTime::UNIX_EPOCH).ok());
+    if let Some(came) = came.and_then(|since| i64::try_from(since.as_nanos()).ok()) {
+        examination.came(Stamp(came));
+    }
     for (at, keyframe) in heard.keyframes {
         let since = first.map_or(Duration::ZERO, |first| at.duration_since(first));
         examination.take(Some(Instant::ZERO.after(since)), keyframe);

@@ -19,12 +19,13 @@ pub(super) fn text(seen: &Examined) -> String {
         text,
         "{}\n\
          \x20 keyframes   {} in {:.1} s, {hz:.2} a second by their stamps; {refused} refused\n\
+         \x20 clock       {}\n\
          \x20 points      {:.0} in each; half lie within {near:.2} m, nine in ten within {far:.2} m\n\
          \x20 steps       {metres:.3} m and {degrees:.2}° from keyframe to keyframe\n\
          \x20 stated σ    x {x:.2e}, y {y:.2e}, z {z:.2e} m; roll {roll:.2e}, pitch {pitch:.2e}, yaw {yaw:.2e} °\n\
          \x20 submaps     {} looked at, as {sensor} at {} m: {:.0} keypoints in each\n\
          \x20 overlap     {aligned} of {tried} submaps align with the one after it",
-        seen.robot, seen.keyframes, seen.secs, seen.points, seen.submaps, seen.voxel_m, seen.keypoints,
+        seen.robot, seen.keyframes, seen.secs, seen.clock, seen.points, seen.submaps, seen.voxel_m, seen.keypoints,
     );
     if let Some(off) = seen.off_odometry_m {
         let _ = write!(text, ", {off:.3} m off the odometry");

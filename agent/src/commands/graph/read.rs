@@ -2,12 +2,13 @@
 
 use super::{BadInput, counted, identity, warn};
 use anyhow::{Error, Result};
-use merganser_protocol::estimate::posegraph::PoseGraph;
 use merganser_protocol::estimate::posegraph::fault::{PoseGraphError, PoseName};
 use merganser_protocol::estimate::posegraph::g2o::{Fault, G2oError, LINE_MAX, Parser, Stated};
 use merganser_protocol::estimate::posegraph::kimera::Importer;
 use merganser_protocol::estimate::posegraph::lines::Files;
 use merganser_protocol::estimate::posegraph::marginals::{Marginal, Reader};
+use merganser_protocol::estimate::posegraph::quaternions::{WFirst, w_first_in};
+use merganser_protocol::estimate::posegraph::{Measurement, PoseGraph};
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::fs::File;
@@ -56,10 +57,35 @@ impl Source {
             let (count, s) = (counted(repeated.count, "measurement"), if repeated.count == 1 { "s" } else { "" });
             warn(&format!("{place}: {count} repeat{s} another to the bit, first here; each counts as one of its own"));
         }
+        for doubt in source.w_first() {
+            warn(&doubt);
+        }
         for id in source.graph.fixed.iter().filter(|id| !source.graph.poses.contains_key(id)) {
             warn(&format!("FIX names {}, which has no vertex and no measurement", PoseName(*id)));
         }
         Ok(source)
+    }
+
+    /// Which files seem to have their quaternions w first.
+    fn w_first(&self) -> Vec<String> {
+        let mut of_files: Vec<Vec<&Measurement>> = vec![Vec::new(); self.names.len()];
+        for measurement in &self.graph.measurements {
+            if let Some(of_file) = of_files.get_mut(self.lines.place(measurement.line).file) {
+                of_file.push(measurement);
+            }
+        }
+        // Values belong to no file: without measurements all are in doubt together.
+        if self.graph.measurements.is_empty() {
+            let names: Vec<String> = self.names.iter().map(|name| name.display().to_string()).collect();
+            let doubt = w_first_in(&self.graph, core::iter::empty());
+            return doubt.into_iter().map(|which: WFirst| format!("{}: {which}", names.join(", "))).collect();
+        }
+        let told = |(name, of_file): (&PathBuf, Vec<&Measurement>)| {
+            let which = w_first_in(&self.graph, of_file.into_iter())?;
+            Some(format!("{}: {which}", name.display()))
+        };
+        // A file of vertices alone says nothing: what speaks of them stands in another.
+        self.names.iter().zip(of_files).filter(|(_, of_file)| !of_file.is_empty()).filter_map(told).collect()
     }
 
     /// An error of a part of the graph: by file and line, or else by the part's smallest pose.

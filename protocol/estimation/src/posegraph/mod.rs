@@ -10,6 +10,7 @@ mod identity;
 pub mod kimera;
 pub mod lines;
 pub mod marginals;
+pub mod quaternions;
 pub mod robust;
 pub mod solve;
 

@@ -42,6 +42,7 @@ mod robust;
 pub mod runs;
 mod sampling;
 mod scene;
+mod sightings;
 pub mod stated;
 pub mod summary;
 mod surface;

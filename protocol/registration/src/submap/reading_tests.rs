@@ -29,6 +29,7 @@ fn found(keyframes: &[Keyframe], config: &SubmapConfig) -> Vec<Oddity> {
 fn reading(keyframes: &[Keyframe]) -> Option<Reading> {
     match found(keyframes, &config())[..] {
         [Oddity::Read { reading, .. }] => Some(reading),
+        [Oddity::WFirst] => Some(Reading::WFirst),
         [] => None,
         ref other => panic!("{other:?}"),
     }
@@ -212,4 +213,26 @@ fn lengths_are_told_beyond_their_bounds_and_not_before() {
     };
     assert_eq!([told(REACH_MAX_M - 1.0, 0.1), told(REACH_MAX_M + 1.0, 0.1)], [0, 1]);
     assert_eq!([told(5.0, 5.0 * STEP_MAX - 0.1), told(5.0, 5.0 * STEP_MAX + 0.1)], [0, 1]);
+}
+
+/// A robot whose sensor tells nothing of its poses, such as landmarks without labels.
+#[test]
+fn quaternions_w_first_show_in_the_poses_alone() {
+    let told = |w_first: bool| {
+        let sent = drive(80, |pose, _| {
+            // Ahead, along x.
+            let heading = pose.rotation.log().z;
+            let pose = Se3::new(
+                So3::exp(&Vector3::new(0.0, 0.0, heading)),
+                pose.translation.component_mul(&Vector3::new(1.0, 1.0, 0.0)),
+            );
+            let [x, y, z, w] = pose.rotation.xyzw();
+            let turn = if w_first { [w, x, y, z] } else { [x, y, z, w] };
+            (Se3::new(So3::from_xyzw(turn).unwrap(), pose.translation), Vec::new())
+        });
+        found(&sent, &config())
+    };
+    assert_eq!(told(false), []);
+    let odd = told(true);
+    assert!(odd == [Oddity::WFirst] && odd[0].to_string().contains("send [x, y, z, w]"), "{odd:?}");
 }

@@ -116,6 +116,15 @@ pub enum Oddity {
         /// Pairs of views that say so, of so many that tell the two apart.
         pairs: [u32; 2],
     },
+    /// Labelled landmarks are where they should be if poses and points are read in another way than they are.
+    Seen {
+        /// In which.
+        reading: Reading,
+        /// Sightings that say so, of so many that tell the two apart.
+        sightings: [u32; 2],
+    },
+    /// The body moves as if quaternions were written w first.
+    WFirst,
     /// Points lie farther off than any sensor sees.
     Reach {
         /// In the median.
@@ -166,6 +175,10 @@ impl fmt::Display for Oddity {
             Self::Read { reading, pairs: [wins, pairs] } => {
                 write!(f, "views lie over one another ({wins} pairs of {pairs}) if {reading}")
             }
+            Self::Seen { reading, sightings: [wins, all] } => {
+                write!(f, "labelled landmarks are where they should be ({wins} sightings of {all}) if {reading}")
+            }
+            Self::WFirst => write!(f, "the body moves one way in its own axes only if {}", Reading::WFirst),
             Self::Reach { metres } => write!(
                 f,
                 "points lie {metres} m off in the median, farther than any sensor sees: most likely they are in millimetres; \

@@ -207,6 +207,9 @@ impl Alignment {
         match work.purpose {
             Purpose::Propose(prediction) => {
                 self.tell_try(context, &work, prediction, outcome.is_ok());
+                if work.further.is_none() {
+                    self.tries.note(work.mine.frame, work.theirs.frame, outcome.as_ref().err().map(|why| why.reason));
+                }
                 match outcome {
                     Ok(measured) => self.propose(context, sources, &work, &measured),
                     Err(why) => {

@@ -14,6 +14,7 @@ mod refusals;
 mod second_look;
 mod shortlist;
 mod stated;
+mod tries;
 
 pub use fetches::POSTPONED_MAX;
 pub use negotiation::{
@@ -40,6 +41,7 @@ use prospects::Prospects;
 use refusals::Refusals;
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use tries::Tries;
 
 /// See the module.
 pub(super) struct Alignment {
@@ -47,6 +49,7 @@ pub(super) struct Alignment {
     refusals: Refusals,
     allowance: Allowance,
     fetches: Fetches,
+    tries: Tries,
 }
 
 /// What the alignment reads of the other parts.
@@ -71,14 +74,20 @@ impl Alignment {
             refusals: Refusals::new(config),
             allowance: Allowance::new(config.align.further_bytes_per_sec, context.now()),
             fetches: Fetches::default(),
+            tries: Tries::default(),
         }
     }
 
     /// What pairs promise, by all that is known now.
     fn prospects<'a>(&'a self, context: &'a Context, sources: Sources<'a>) -> Prospects<'a> {
-        let Self { negotiation, allowance, fetches, refusals: _ } = self;
+        let Self { negotiation, allowance, fetches, refusals: _, tries: _ } = self;
         let Sources { knowledge, blobs, estimation } = sources;
         Prospects { context, negotiation, allowance, fetches, knowledge, blobs, estimation }
+    }
+
+    /// What became of pairs that were tried with others.
+    pub(super) fn tries(&self) -> &Tries {
+        &self.tries
     }
 
     /// When something is to be done that was put off.
