@@ -80,8 +80,8 @@ proptest! {
             prop_assert_eq!(found(Some(true), Some(false)), Some(WFirst::Vertices));
             prop_assert_eq!(found(Some(false), Some(true)), Some(WFirst::Edges));
         }
-        // Steps from pose to pose tell it without values as well.
-        if apart == 1 {
+        // Steps from pose to pose that turn little tell it without values as well.
+        if apart == 1 && turn < 0.2 {
             prop_assert_eq!(found(None, Some(true)), Some(WFirst::Edges));
         }
     }
