@@ -86,6 +86,10 @@ impl Se2 {
         Matrix3::new(c, -s, t.y, s, c, -t.x, 0.0, 0.0, 1.0)
     }
 
+    fn applied_to(&self, p: &Vector2<f64>) -> Vector2<f64> {
+        turned(&self.heading, p) + self.translation
+    }
+
     /// The pose a fraction `s` of the way (along the geodesic) to `other`.
     #[must_use]
     pub fn interpolate(&self, other: &Self, s: f64) -> Self {
@@ -100,7 +104,7 @@ impl core::ops::Mul for Se2 {
         let heading = turned(&self.heading, &other.heading);
         Self {
             heading: heading * (1.5 - 0.5 * heading.norm_squared()),
-            translation: turned(&self.heading, &other.translation) + self.translation,
+            translation: self.applied_to(&other.translation),
         }
     }
 }
@@ -108,7 +112,7 @@ impl core::ops::Mul for Se2 {
 impl core::ops::Mul<Vector2<f64>> for Se2 {
     type Output = Vector2<f64>;
     fn mul(self, p: Vector2<f64>) -> Vector2<f64> {
-        turned(&self.heading, &p) + self.translation
+        self.applied_to(&p)
     }
 }
 
@@ -199,11 +203,14 @@ fn blocks(of_rho: &Matrix2<f64>, of_angle: &Vector2<f64>) -> Matrix3<f64> {
 mod tests {
     use super::*;
     use crate::se3;
+    use core::f64::consts::PI;
     use nalgebra::Vector6;
     use proptest::prelude::*;
 
     fn tangent() -> impl Strategy<Value = Vector3<f64>> {
-        ((-20.0..20.0_f64), (-20.0..20.0_f64), (-3.14..3.14_f64)).prop_map(|(x, y, angle)| Vector3::new(x, y, angle))
+        // At the half turn itself either sign of a log is right.
+        let turn = PI - 1e-3;
+        ((-20.0..20.0_f64), (-20.0..20.0_f64), (-turn..turn)).prop_map(|(x, y, angle)| Vector3::new(x, y, angle))
     }
 
     fn in_space(xi: &Vector3<f64>) -> Vector6<f64> {
