@@ -150,7 +150,7 @@ impl Default for FrameConsensusConfig {
     }
 }
 
-/// Aligns two metric frames; those of planar robots in their three degrees of freedom, see [`planar`].
+/// Aligns two metric frames; those of planar robots in their three degrees of freedom (`planar.rs`).
 pub fn align_frames(
     alpha: &Trajectory,
     beta: &Trajectory,
