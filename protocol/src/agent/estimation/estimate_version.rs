@@ -28,7 +28,7 @@ mod tests {
     fn every_option_that_changes_the_map_shows_and_no_other() {
         let usual = EstimateConfig::default();
         let shown = fingerprint(&usual);
-        assert!(shown.starts_with("2-") && shown.len() == 18, "{shown}");
+        assert!(shown.starts_with(&format!("{ESTIMATE_VERSION}-")) && shown.len() == 18, "{shown}");
         let others = [
             EstimateConfig { alignments_min: 4, ..usual.clone() },
             EstimateConfig { log10_nfa_max: -5.0, ..usual.clone() },
