@@ -71,6 +71,8 @@ fn is_flat(t: &PoseWithCovariance) -> bool {
     };
     t.pose.translation.z.abs() <= FLAT_MAX
         && tilt <= FLAT_MAX
+        // Upside down has no tilt, either.
+        && r[(2, 2)] > 0.0
         && IN_PLANE.into_iter().flat_map(|r| OUT_OF_PLANE.map(|c| (r, c))).all(apart)
 }
 

@@ -249,7 +249,8 @@ fn what_leaves_the_plane_is_decided_in_space() {
     let flat = World::planar(3, draw(4, 0, 4));
     let planar = |w: &World| planar::is_planar(&w.alpha, &w.beta, &w.alignments);
     assert!(planar(&flat) && !planar(&World::new(3, draw(4, 0, 4))));
-    for nudge in [Vector6::z() * 1e-3, Vector6::new(0.0, 0.0, 0.0, 1e-3, 0.0, 0.0)] {
+    let tilted_by = |roll: f64| Vector6::new(0.0, 0.0, 0.0, roll, 0.0, 0.0);
+    for nudge in [Vector6::z() * 1e-3, tilted_by(1e-3), tilted_by(core::f64::consts::PI)] {
         let mut w = flat.clone();
         w.alignments[2].t_i_j.pose = w.alignments[2].t_i_j.pose.retract(&nudge);
         assert!(!planar(&w), "{nudge}");
