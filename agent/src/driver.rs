@@ -135,6 +135,7 @@ pub struct Driver<C, N> {
     journal_flushed: Instant,
     inputs: u64,
     vain: Vain,
+    told_vain: vain::Told,
 }
 
 impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
@@ -143,7 +144,15 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
         let (sender, views) = mpsc::channel(VIEWS_WAITING);
         let workers = Arc::new(Semaphore::new(parts.jobs.max(1)));
         (
-            Self { parts, workers, views, journal_flushed: Instant::ZERO, inputs: 0, vain: Vain::default() },
+            Self {
+                parts,
+                workers,
+                views,
+                journal_flushed: Instant::ZERO,
+                inputs: 0,
+                vain: Vain::default(),
+                told_vain: vain::Told::new(),
+            },
             Snapshots(sender),
         )
     }
@@ -234,7 +243,7 @@ impl<C: Core + Send + 'static, N: Network> Driver<C, N> {
             }
         }
         let seen = if is_vain { self.parts.core.overview(self.parts.clock.now()) } else { None };
-        for told in seen.iter().flat_map(|seen| vain::told(&seen.frames)) {
+        for told in seen.iter().flat_map(|seen| vain::told(&seen.frames, &mut self.told_vain)) {
             info!("{told}");
         }
     }

@@ -70,6 +70,14 @@ pub enum TrustError {
         /// The file.
         path: PathBuf,
     },
+    /// The file is encrypted in a way that is not read, or holds another key.
+    #[error("key file {path} cannot be read: {why}; encrypt the key anew, by `openssl pkcs8 -topk8 -scrypt`")]
+    UnreadKey {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        why: String,
+    },
     /// The passphrase does not open the file.
     #[error("key file {path}: the passphrase is wrong")]
     WrongPassphrase {

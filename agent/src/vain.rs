@@ -14,6 +14,9 @@ pub const FRAMES_MAX: usize = 256;
 #[derive(Clone, Debug, Default)]
 pub struct Vain(BTreeMap<(FrameId, FrameId), (u64, bool)>);
 
+/// What was told, by the other's frame, ours, and the number of tries: told once.
+pub type Told = std::collections::BTreeSet<(String, String, u64)>;
+
 impl Vain {
     /// Counts a try; whether it is to be told now how they went.
     pub fn note(&mut self, i: FrameId, j: FrameId, found: bool) -> bool {
@@ -28,13 +31,14 @@ impl Vain {
     }
 }
 
-/// What is told of the frames of which it is due, unless the other side found something.
-pub fn told(frames: &FramesView) -> Vec<String> {
+/// What is told of the frames of which it is due and was not `before`, unless the other side found something.
+pub fn told(frames: &FramesView, before: &mut Told) -> Vec<String> {
     let has_pair = |tries: &TriesView| {
         let is = |a: &str, b: &str| frames.pairs.iter().any(|pair| pair.a == a && pair.b == b);
         is(&tries.own, &tries.other) || is(&tries.other, &tries.own)
     };
     let due = frames.tries.iter().filter(|tries| TOLD_AT.contains(&tries.tried()) && !has_pair(tries));
+    let due = due.filter(|tries| before.insert((tries.other.clone(), tries.own.clone(), tries.tried())));
     due.filter_map(|tries| Some(format!("no submap aligns with any of {}: {}", tries.other, tries.told()?))).collect()
 }
 
@@ -80,13 +84,16 @@ mod tests {
             tries: vec![tries],
         };
         assert_eq!(
-            told(&frames),
+            told(&frames, &mut Told::new()),
             [
                 "no submap aligns with any of beta/2: 24 pairs of submaps were tried and none aligned, 19 since nothing fits \
                  better than chance: they may have seen no common place yet; if they have, see that all robots state the same \
                  submap.sensor and voxel_m, and that merganser doctor finds nothing odd about either"
             ]
         );
+        // Another pair's turn tells it no second time.
+        let mut before = Told::new();
+        assert_eq!([told(&frames, &mut before).len(), told(&frames, &mut before).len()], [1, 0]);
         frames.pairs.push(PairView {
             a: "alpha/1".into(),
             b: "beta/2".into(),
@@ -99,6 +106,6 @@ mod tests {
             middle: None,
             reason: String::new(),
         });
-        assert_eq!(told(&frames), Vec::<String>::new());
+        assert_eq!(told(&frames, &mut Told::new()), Vec::<String>::new());
     }
 }

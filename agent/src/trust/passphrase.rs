@@ -6,7 +6,9 @@ use super::{KEY_LEN, OTHERS, SecretKey, TrustError};
 use pkcs8::der::Decode;
 use pkcs8::der::SecretDocument;
 use pkcs8::der::pem::PemLabel;
-use pkcs8::{EncryptedPrivateKeyInfoRef, LineEnding, PrivateKeyInfoRef};
+use pkcs8::pkcs5::EncryptionScheme;
+use pkcs8::pkcs5::pbes2::Kdf;
+use pkcs8::{EncryptedPrivateKeyInfoRef, LineEnding, PrivateKeyInfoRef, pkcs5};
 use rand::rngs::SysRng;
 use std::fs::File;
 use std::io::Read;
@@ -16,6 +18,13 @@ use zeroize::Zeroizing;
 
 /// Longest passphrase, in bytes.
 pub const PASSPHRASE_LEN_MAX: usize = 1024;
+/// Most memory, in bytes, that deriving the key of a file may take: 128 N r of scrypt. `keys generate` and openssl take 16
+/// MiB.
+pub const SCRYPT_BYTES_MAX: u64 = 64 << 20;
+/// Most passes of scrypt (p), and of PBKDF2, the other way that openssl has: seconds on a small computer.
+pub const SCRYPT_PASSES_MAX: u16 = 16;
+/// See [`SCRYPT_PASSES_MAX`].
+pub const PBKDF2_PASSES_MAX: u32 = 4_000_000;
 /// First line of an encrypted key file.
 const BEGIN: &str = "-----BEGIN ENCRYPTED PRIVATE KEY-----";
 /// What stands before the 32 bytes of a secret ed25519 key in DER (PKCS #8, RFC 8410).
@@ -114,17 +123,47 @@ pub(super) fn decrypt(text: &str, passphrase: &[u8], path: &Path) -> Result<Secr
     let damaged = || TrustError::NoEncryptedKey { path: path.into() };
     let (_, document) = SecretDocument::from_pem(text.trim()).map_err(|_| damaged())?;
     let info = EncryptedPrivateKeyInfoRef::from_der(document.as_bytes()).map_err(|_| damaged())?;
+    let unread = |why: &str| TrustError::UnreadKey { path: path.into(), why: why.into() };
+    if !is_bounded(&info.encryption_algorithm) {
+        return Err(unread(
+            "it asks for more work than a small computer has, or is encrypted in another way than PBES2",
+        ));
+    }
     // A wrong passphrase shows as wrong padding, or as bytes that are no key.
     let wrong = || TrustError::WrongPassphrase { path: path.into() };
-    let clear = info.decrypt(passphrase).map_err(|_| wrong())?;
-    let secret = clear.as_bytes().strip_prefix(&DER_HEAD).ok_or_else(wrong)?;
+    let clear = info.decrypt(passphrase).map_err(|error| match error {
+        pkcs8::Error::EncryptedPrivateKey(
+            other @ (pkcs5::Error::UnsupportedAlgorithm { .. } | pkcs5::Error::AlgorithmParametersInvalid { .. }),
+        ) => unread(&other.to_string()),
+        _ => wrong(),
+    })?;
+    let Some(secret) = clear.as_bytes().strip_prefix(&DER_HEAD) else {
+        let is_key = PrivateKeyInfoRef::from_der(clear.as_bytes()).is_ok();
+        return Err(if is_key { unread("what is in it is no ed25519 key of version 1") } else { wrong() });
+    };
     let secret = Zeroizing::new(<[u8; KEY_LEN]>::try_from(secret).map_err(|_| wrong())?);
     Ok(SecretKey::from_bytes(*secret))
+}
+
+/// Whether deriving the key takes what a small computer has, and the numbers of its file are such as the derivation takes.
+fn is_bounded(scheme: &EncryptionScheme) -> bool {
+    let EncryptionScheme::Pbes2(parameters) = scheme else { return false };
+    match &parameters.kdf {
+        Kdf::Scrypt(scrypt) => {
+            let bytes = scrypt.cost_parameter.checked_mul(128 * u64::from(scrypt.block_size));
+            (scrypt.cost_parameter >= 2 && scrypt.cost_parameter.is_power_of_two())
+                && bytes.is_some_and(|bytes| (1..=SCRYPT_BYTES_MAX).contains(&bytes))
+                && (1..=SCRYPT_PASSES_MAX).contains(&scrypt.parallelization)
+        }
+        Kdf::Pbkdf2(pbkdf2) => (1..=PBKDF2_PASSES_MAX).contains(&pbkdf2.iteration_count),
+        _ => false,
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use pkcs8::der::EncodePem;
     use std::fs;
 
     fn folder_with(passphrase: &str, mode: u32) -> (tempfile::TempDir, Passphrase) {
@@ -154,6 +193,44 @@ mod tests {
             fs::write(&path, damage).unwrap();
             assert!(matches!(SecretKey::load_with(&path, &good), Err(TrustError::NoEncryptedKey { .. })), "{damage}");
         }
+    }
+
+    #[test]
+    fn what_no_small_computer_derives_and_other_keys_are_told_as_such() {
+        let (folder, good) = folder_with("correct horse", 0o600);
+        let path = folder.path().join("alpha.key");
+        SecretKey::generate().unwrap().save_with(&path, &good).unwrap();
+        let text = fs::read_to_string(&path).unwrap();
+        let (_, document) = SecretDocument::from_pem(text.trim()).unwrap();
+        let opened = |change: &dyn Fn(&mut pkcs5::pbes2::ScryptParams)| {
+            let mut info = EncryptedPrivateKeyInfoRef::from_der(document.as_bytes()).unwrap();
+            let EncryptionScheme::Pbes2(parameters) = &mut info.encryption_algorithm else { panic!("PBES2") };
+            let Kdf::Scrypt(scrypt) = &mut parameters.kdf else { panic!("scrypt") };
+            change(scrypt);
+            let pem = info.to_pem(LineEnding::LF).unwrap();
+            fs::write(&path, pem.as_bytes()).unwrap();
+            SecretKey::load_with(&path, &good).map(|_| ())
+        };
+        assert!(opened(&|_| {}).is_ok());
+        let largest = SCRYPT_BYTES_MAX / (128 * 8);
+        // At the bound the passphrase is tried, and does not fit what is changed; beyond it nothing is derived.
+        assert!(matches!(opened(&|scrypt| scrypt.cost_parameter = largest), Err(TrustError::WrongPassphrase { .. })));
+        for cost in [0, 1, 3, 2 * largest, 1 << 40, u64::MAX] {
+            let refused = opened(&|scrypt| scrypt.cost_parameter = cost);
+            assert!(matches!(refused, Err(TrustError::UnreadKey { .. })), "{cost}");
+        }
+        for (size, passes) in [(0, 1), (8, 0), (8, SCRYPT_PASSES_MAX + 1), (u16::MAX, 1)] {
+            let refused = opened(&|scrypt| (scrypt.block_size, scrypt.parallelization) = (size, passes));
+            assert!(matches!(refused, Err(TrustError::UnreadKey { .. })), "{size} {passes}");
+        }
+        // A key of X25519: by its algorithm's last byte.
+        let mut der = key_der(&[7; KEY_LEN]).to_vec();
+        der[11] = 0x6e;
+        let other = PrivateKeyInfoRef::from_der(&der).unwrap().encrypt_with_rng(&mut SysRng, b"correct horse").unwrap();
+        fs::write(&path, other.to_pem(EncryptedPrivateKeyInfoRef::PEM_LABEL, LineEnding::LF).unwrap().as_bytes())
+            .unwrap();
+        let refused = SecretKey::load_with(&path, &good).unwrap_err().to_string();
+        assert!(refused.contains("no ed25519 key") && refused.contains("openssl"), "{refused}");
     }
 
     #[test]

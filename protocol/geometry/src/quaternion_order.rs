@@ -103,7 +103,8 @@ impl QuaternionOrder {
         }
         let along = |scatter: &Matrix3<f64>| scatter.symmetric_eigenvalues().max() / way;
         let (read, other) = (along(read), along(other));
-        let goes_ahead = other >= ALONG_MIN;
+        // A half turn about (0, s, c) maps x to −x: a way along the frame's x looks driven however the body turns.
+        let goes_ahead = other >= ALONG_MIN && in_frame[(0, 0)] < ALONG_MIN * way;
         let poses = f64::from(self.poses);
         let turns_about_x = (self.aside / poses).sqrt() <= ASIDE_MAX
             && self.about_x[0].hypot(self.about_x[1]) <= VARIES * poses

@@ -49,6 +49,17 @@ fn a_straight_way_and_too_few_steps_tell_nothing() {
 }
 
 #[test]
+fn a_straight_way_with_a_swinging_heading_is_not_doubted() {
+    // Held in the hand down a corridor, looking left and right; and spinning while it goes along.
+    for heading in [|k: f64| 1.05 * (0.9 * k).sin(), |k: f64| 0.5 * k] {
+        for direction in [Vector3::x(), -Vector3::x(), Vector3::y(), Vector3::new(0.8, 0.6, 0.0)] {
+            let at = |k: f64| Se3::new(So3::exp(&Vector3::new(0.0, 0.0, heading(k))), direction * k);
+            assert!(!is_doubted(&(0..80).map(f64::from).map(at).collect::<Vec<_>>()), "{direction}");
+        }
+    }
+}
+
+#[test]
 fn what_stands_or_is_not_finite_is_no_step() {
     let mut order = QuaternionOrder::default();
     for _ in 0..100 {

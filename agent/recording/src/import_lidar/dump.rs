@@ -176,16 +176,17 @@ impl Dump {
     }
 }
 
-/// Says which scans are missing: numbers that the others' usual step leaves out. A thinned sequence has a larger step.
-fn missing(frames: &[Frame]) -> Option<String> {
+/// Says which scans are missing: whole steps that the others' usual one leaves out. A thinned sequence has a larger step,
+/// and names that are times have uneven ones.
+pub(super) fn missing(frames: &[Frame]) -> Option<String> {
     let steps: Vec<u64> = frames.windows(2).map(|two| two[1].number - two[0].number).collect();
     let mut sorted = steps.clone();
     sorted.sort_unstable();
     let usual = *sorted.get(sorted.len() / 2)?;
     let are_counted = 2 * steps.iter().filter(|step| **step == usual).count() > steps.len();
-    let gaps: Vec<(usize, u64)> = steps.iter().copied().enumerate().filter(|(_, step)| *step > usual).collect();
+    let gaps: Vec<(usize, u64)> = steps.iter().copied().enumerate().filter(|(_, step)| step / usual >= 2).collect();
     let (after, _) = *gaps.first().filter(|_| are_counted)?;
-    let count: u64 = gaps.iter().map(|(_, step)| step.div_ceil(usual) - 1).sum();
+    let count: u64 = gaps.iter().map(|(_, step)| step / usual - 1).sum();
     let (first, s) = (frames[after].number + usual, if count == 1 { " is" } else { "s are" });
     Some(format!(
         "{count} scan{s} missing between the others, the first {first:06}: the motion across is longer, and its error taken to \

@@ -172,7 +172,10 @@ pub(super) fn seconds(text: &str) -> Result<Stamp, Problem> {
     let (whole, part) = text.split_once('.').unwrap_or((text, ""));
     let digits: String = part.chars().chain(core::iter::repeat('0')).take(9).collect();
     let nanos = match (whole.parse::<i64>(), digits.parse::<i64>()) {
-        (Ok(whole), Ok(nanos)) if whole >= 0 && !text.starts_with('-') => whole * 1_000_000_000 + nanos,
+        // Digits before an exponent are no nanoseconds.
+        (Ok(whole), Ok(nanos)) if whole >= 0 && !text.starts_with('-') && !text.contains(['e', 'E']) => {
+            whole * 1_000_000_000 + nanos
+        }
         _ => (secs * 1e9).round() as i64,
     };
     Ok(Stamp(nanos))

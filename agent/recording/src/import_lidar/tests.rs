@@ -1,5 +1,7 @@
 //! Dumps of LiDAR SLAMs that people have: read with the poses and times that they mean, or named with the cure.
 
+use super::dump::{Frame, missing};
+use super::poses::seconds;
 use crate::import::{Kind, Prepared, detect, prepare};
 use crate::{Recording, RecordingError};
 use merganser_protocol::geometry::{Se3, So3};
@@ -7,7 +9,7 @@ use merganser_protocol::submap::SubmapBuilder;
 use nalgebra::{Matrix3, Vector3};
 use std::fmt::Write as _;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 /// Scans of a data set.
@@ -405,6 +407,20 @@ fn the_times_of_a_sequence_are_read() {
 }
 
 #[test]
+fn times_are_read_as_they_are_written() {
+    for (text, nanos) in [
+        ("1.036224123456789000e-01", 103_622_412),
+        ("1.036224e-01", 103_622_400),
+        ("1.5E+01", 15_000_000_000),
+        ("1700000000.123456789", 1_700_000_000_123_456_789),
+        ("-0.5", -500_000_000),
+        ("7", 7_000_000_000),
+    ] {
+        assert_eq!(seconds(text).unwrap().0, nanos, "{text}");
+    }
+}
+
+#[test]
 fn a_scan_that_is_missing_between_others_is_told_and_a_thinned_sequence_is_none() {
     let truth = way(1.0);
     let told = |every: usize, without: &[usize]| {
@@ -423,6 +439,13 @@ fn a_scan_that_is_missing_between_others_is_told_and_a_thinned_sequence_is_none(
         more.len() == 1 && more[0].contains("3 scans are missing between the others, the first 000003"),
         "{more:?}"
     );
+    // Names that are times step unevenly.
+    let numbered = |numbers: &[u64]| -> Vec<Frame> {
+        let frame = |&number: &u64| Frame { number, stamp: None, pose: Se3::identity(), source: PathBuf::new() };
+        numbers.iter().map(frame).collect()
+    };
+    assert_eq!(missing(&numbered(&[0, 100, 200, 301, 401, 501])), None);
+    assert!(missing(&numbered(&[0, 100, 200, 301, 501, 601])).unwrap().starts_with("1 scan is missing"));
     let thinned = told(2, &[4]);
     assert!(
         thinned.len() == 1 && thinned[0].contains("1 scan is missing between the others, the first 000004"),

@@ -15,6 +15,7 @@ use merganser_protocol::time::Stamp;
 use merganser_recording::manifest::CloudFormat;
 use nalgebra::Vector3;
 use std::collections::BTreeSet;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -107,12 +108,13 @@ fn of_bag(name: String, bag: &Path, number: usize, args: &AlignArgs) -> Result<S
 /// The points of a keyframe, as a SLAM sends it in JSON.
 fn of_message(name: String, path: &Path) -> Result<Source> {
     let told = |why: String| BadInput::told(format!("{name}: {why}"));
-    let bytes = match std::fs::metadata(path) {
-        Ok(file) if file.len() > MESSAGE_BYTES_MAX => {
-            return Err(told(format!("has more than {MESSAGE_BYTES_MAX} bytes, which no agent takes in one message")));
-        }
-        _ => std::fs::read(path).map_err(|error| told(error.to_string()))?,
-    };
+    let mut bytes = Vec::new();
+    // Whatever size the file states: that of a pipe is 0.
+    let file = std::fs::File::open(path).map_err(|error| told(error.to_string()))?;
+    file.take(MESSAGE_BYTES_MAX + 1).read_to_end(&mut bytes).map_err(|error| told(error.to_string()))?;
+    if bytes.len() as u64 > MESSAGE_BYTES_MAX {
+        return Err(told(format!("has more than {MESSAGE_BYTES_MAX} bytes, which no agent takes in one message")));
+    }
     let keyframe = observation::keyframe(Format::Json, &bytes).map_err(|error| told(error.to_string()))?;
     if keyframe.points.is_empty() {
         return Err(told("has no points".into()));

@@ -7,8 +7,9 @@ use time::{Duration, OffsetDateTime};
 pub const SET_MIN_NS: i64 = 94_608_000 * 1_000_000_000;
 /// Clocks this near one another are one, s: what a keyframe may take on its way.
 pub const SAME_SECS: f64 = 2.0;
-/// A stamp that is the present time in another unit is so to this, s since 1970: four months.
-const UNIT_SLACK_SECS: f64 = 1e7;
+/// A stamp that is the present time in another unit is so to this, s since 1970: a day. A good clock of nanoseconds since a
+/// start shows the present microseconds for three minutes, after 20 days.
+const UNIT_SLACK_SECS: f64 = 86_400.0;
 /// Units, and how many of them are a second.
 const UNITS: [(&str, f64); 3] = [("seconds", 1.0), ("milliseconds", 1e3), ("microseconds", 1e6)];
 
@@ -76,6 +77,10 @@ mod tests {
         for (unit, per_ns) in [("seconds", 1_000_000_000), ("milliseconds", 1_000_000), ("microseconds", 1_000)] {
             assert_eq!(told(NOW / per_ns), format!("the stamps are this host's time in {unit}: send nanoseconds"));
         }
+        // Nanoseconds since a start 20 days ago are near the present microseconds.
+        let since_start = |off_secs: i64| told(NOW / 1_000 + off_secs * 1_000_000_000);
+        assert!(since_start(90).contains("since a start") && since_start(-90).contains("since a start"));
+        assert!(since_start(80).contains("microseconds") && since_start(-80).contains("microseconds"));
         // Of a recording nobody knows when it came.
         assert_eq!(text(NOW, None), "begins at 2023-11-14 22:13:20 UTC");
         assert!(text(NOW / 1_000_000_000, None).contains("no date"));
