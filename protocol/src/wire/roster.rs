@@ -76,7 +76,7 @@ pub struct Roster {
 }
 
 /// Which statement it is. The greater one counts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct RosterHead {
     /// Its version.
     pub version: u64,
@@ -102,7 +102,9 @@ pub struct Listed {
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum StatementError {
     /// Longer than [`ROSTER_LEN_MAX`].
-    #[error("the roster has {0} bytes; at most {ROSTER_LEN_MAX} travel")]
+    #[error(
+        "the roster has {0} bytes; at most {ROSTER_LEN_MAX} travel: leave out old keys and what is kept of revoked ones"
+    )]
     TooLong(usize),
     /// Too short to hold a signature.
     #[error("{0} bytes are too short for a roster; take a whole copy of the file")]
@@ -132,8 +134,11 @@ pub enum StatementError {
         /// The limit.
         max: usize,
     },
+    /// The swarm's own key, which signs rosters and stays off the robots.
+    #[error("the key of {0} is the swarm's own, which no robot or observer may hold; make another by `merganser keys`")]
+    OwnKey(Name),
     /// Not an ed25519 public key, or a weak one.
-    #[error("the key of {0} is not a usable ed25519 public key; take the line that `merganser swarm join` printed")]
+    #[error("the key of {0} is not a usable ed25519 public key; take the line that `merganser keys generate` printed")]
     Key(Name),
     /// One key under two names, or twice under one.
     #[error(
@@ -175,6 +180,7 @@ impl StatementError {
             Self::NonCanonical => "roster_non_canonical",
             Self::Signature => "roster_signature",
             Self::TooMany { .. } => "roster_too_many",
+            Self::OwnKey(_) => "roster_own_key",
             Self::Key(_) => "roster_key",
             Self::KeyTwice(..) => "roster_key_twice",
             Self::NameTwice(_) => "roster_name_twice",
@@ -212,8 +218,8 @@ impl Roster {
     /// # Errors
     /// [`StatementError`] if the content contradicts itself or is over a limit.
     pub fn sign(key: &SigningKey, content: RosterContent) -> Result<Self, StatementError> {
-        content.check()?;
         let swarm_key = key.verifying_key().to_bytes();
+        content.check(&swarm_key)?;
         let mut bytes = to_bytes(&RawBody::of(&content, swarm_key));
         let signature = key.sign(&signed_bytes(&bytes)).to_bytes();
         bytes.extend_from_slice(&signature);
@@ -266,7 +272,7 @@ impl Roster {
         let key = usable(&swarm_key).ok_or(StatementError::Signature)?;
         key.verify_strict(&signed_bytes(body), &Signature::from_bytes(signature))
             .map_err(|_| StatementError::Signature)?;
-        content.check()?;
+        content.check(&swarm_key)?;
         Ok(Self { content, swarm_key, signature: *signature, hash: Hash::of(bytes) })
     }
 
@@ -343,7 +349,7 @@ impl RosterContent {
         members.chain(observers).chain(self.revoked.iter().map(|(key, revoked)| (key, &revoked.name)))
     }
 
-    fn check(&self) -> Result<(), StatementError> {
+    fn check(&self, swarm_key: &Key) -> Result<(), StatementError> {
         let most = |what, count, max| match count > max {
             true => Err(StatementError::TooMany { what, count, max }),
             false => Ok(()),
@@ -359,6 +365,9 @@ impl RosterContent {
         }
         let mut seen = BTreeMap::new();
         for (key, name) in self.keys() {
+            if key == swarm_key {
+                return Err(StatementError::OwnKey(name.clone()));
+            }
             if usable(key).is_none() {
                 return Err(StatementError::Key(name.clone()));
             }

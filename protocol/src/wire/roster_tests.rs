@@ -128,7 +128,11 @@ fn a_roster_that_contradicts_itself_is_neither_signed_nor_read() {
         one
     };
     type Change = Box<dyn FnOnce(&mut RosterContent)>;
-    let cases: [(&str, Change); 7] = [
+    let own = swarm_key().verifying_key().to_bytes();
+    let cases: [(&str, Change); 10] = [
+        ("roster_own_key", Box::new(move |c| c.members.get_mut(&name("r0")).unwrap().key = own)),
+        ("roster_own_key", Box::new(move |c| c.members.get_mut(&name("r0")).unwrap().old = Some(own))),
+        ("roster_own_key", Box::new(move |c| c.observers.extend([(name("x"), own)]))),
         ("roster_key_twice", Box::new(|c| c.members.get_mut(&name("r0")).unwrap().key = public(2))),
         ("roster_key_twice", Box::new(|c| c.members.get_mut(&name("r0")).unwrap().old = Some(public(0)))),
         ("roster_key_twice", Box::new(|c| c.observers.extend([(name("x"), public(11))]))),

@@ -87,3 +87,7 @@ fn out_of_plane(alpha: &Trajectory, beta: &Trajectory, a: &PairAlignment) -> Opt
 fn rest_of(sigma: &Matrix6<f64>) -> f64 {
     OUT_OF_PLANE.iter().map(|&k| sigma[(k, k)]).sum()
 }
+
+#[cfg(test)]
+#[path = "planar_tests.rs"]
+mod tests;

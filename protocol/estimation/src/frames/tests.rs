@@ -2,9 +2,7 @@
 
 use super::world::{Draw, World};
 use super::*;
-use crate::geometry::Se2;
 use crate::geometry::sampling::{normals, rng};
-use crate::geometry::se2::in_plane;
 use nalgebra::Vector6;
 use rand::seq::SliceRandom;
 
@@ -12,20 +10,20 @@ const SEEDS: u64 = 100;
 
 /// How often each outcome came, over seeded worlds.
 #[derive(Debug, Default)]
-struct Tally {
+pub(super) struct Tally {
     /// Merged within 8° and 3 m of the truth.
-    right: u32,
+    pub(super) right: u32,
     /// Merged on true alignments alone, too few or too close together to come that near.
-    weak: u32,
+    pub(super) weak: u32,
     /// Merged, and neither.
-    wrong: u32,
-    provisional: u32,
-    ambiguous: u32,
-    inconsistent: u32,
-    none: u32,
+    pub(super) wrong: u32,
+    pub(super) provisional: u32,
+    pub(super) ambiguous: u32,
+    pub(super) inconsistent: u32,
+    pub(super) none: u32,
 }
 
-fn config(covariance_scale_max: f64) -> FrameConsensusConfig {
+pub(super) fn config(covariance_scale_max: f64) -> FrameConsensusConfig {
     FrameConsensusConfig { covariance_scale_max, ..FrameConsensusConfig::default() }
 }
 
@@ -33,9 +31,14 @@ fn tally(draw: Draw, config: &FrameConsensusConfig) -> Tally {
     tally_of(World::new, align_frames, draw, config)
 }
 
-type Align = fn(&Trajectory, &Trajectory, &[PairAlignment], &FrameConsensusConfig) -> FrameOutcome;
+pub(super) type Align = fn(&Trajectory, &Trajectory, &[PairAlignment], &FrameConsensusConfig) -> FrameOutcome;
 
-fn tally_of(world: fn(u64, Draw) -> World, align: Align, draw: Draw, config: &FrameConsensusConfig) -> Tally {
+pub(super) fn tally_of(
+    world: fn(u64, Draw) -> World,
+    align: Align,
+    draw: Draw,
+    config: &FrameConsensusConfig,
+) -> Tally {
     let mut tally = Tally::default();
     for seed in 0..SEEDS {
         let w = world(7000 + seed, draw);
@@ -53,7 +56,7 @@ fn tally_of(world: fn(u64, Draw) -> World, align: Align, draw: Draw, config: &Fr
     tally
 }
 
-fn draw(real: usize, aliased: usize, random: usize) -> Draw {
+pub(super) fn draw(real: usize, aliased: usize, random: usize) -> Draw {
     Draw { real, aliased, random, under_reported: 1.0 }
 }
 
@@ -156,40 +159,6 @@ fn a_doubtful_member_leaves_the_others_to_merge_alone() {
     assert!(dropped >= 15, "{dropped} dropped, {kept} kept");
 }
 
-/// As [`align_frames`], in six degrees of freedom wherever the robots move.
-fn in_space(
-    alpha: &Trajectory,
-    beta: &Trajectory,
-    alignments: &[PairAlignment],
-    config: &FrameConsensusConfig,
-) -> FrameOutcome {
-    let rigid = alignments.iter().map(|a| (a.i, a.j, (a.t_i_j.pose, a.t_i_j.covariance, true)));
-    Measured::<6, Se3>::new(alpha, beta, rigid, config)
-        .outcome()
-        .map(|_, pose, covariance| PoseWithCovariance { pose, covariance })
-}
-
-#[test]
-fn planar_frames_are_decided_in_the_plane() {
-    for (d, right, ambiguous) in [
-        (draw(4, 0, 16), 98, 0),
-        (draw(3, 0, 17), 70, 0),
-        (draw(10, 5, 5), 99, 0),
-        (draw(4, 3, 13), 97, 0),
-        (draw(4, 4, 12), 0, 98),
-        (Draw { under_reported: 3.0, ..draw(4, 0, 16) }, 75, 0),
-        (draw(0, 0, 20), 0, 0),
-        (draw(0, 0, 60), 0, 0),
-    ] {
-        let plane = tally_of(World::planar, align_frames, d, &config(3.0));
-        let space = tally_of(World::planar, in_space, d, &config(3.0));
-        println!("{d:?}\n  plane {plane:?}\n  space {space:?}");
-        assert!(plane.right >= right && plane.ambiguous >= ambiguous && plane.wrong == 0, "{plane:?}");
-        // Six degrees of freedom do worse: what they add is not measured.
-        assert!(plane.right + 2 >= space.right && plane.ambiguous + 2 >= space.ambiguous, "{plane:?} {space:?}");
-    }
-}
-
 #[test]
 fn two_alignments_are_shown_and_three_are_used() {
     let w = World::new(1, draw(3, 0, 0));
@@ -222,50 +191,6 @@ fn the_covariance_is_honest() {
     println!("ANEES {anees:.3}, {:.1} % inside the 95 % ellipsoid", 100.0 * inside);
     assert!((5.6 * 0.95..6.4 * 1.1).contains(&anees), "ANEES {anees}");
     assert!((0.92..0.98).contains(&inside), "{inside} inside the 95 % ellipsoid");
-}
-
-#[test]
-fn the_covariance_of_planar_frames_is_honest_in_the_plane() {
-    let (runs, mut sum, mut inside) = (300, 0.0, 0);
-    for seed in 0..runs {
-        let w = World::planar(20_000 + seed, draw(10, 0, 0));
-        let outcome = align_frames(&w.alpha, &w.beta, &w.alignments, &config(3.0));
-        let FrameOutcome::Merged(c) = outcome else { panic!("seed {seed}: {outcome:?}") };
-        let error = Se2::of(&c.t_alpha_beta.pose).local(&Se2::of(&w.t_alpha_beta));
-        let nees = Covariance::new(in_plane(c.t_alpha_beta.covariance.matrix())).unwrap().mahalanobis_squared(&error);
-        (sum, inside) = (sum + nees, inside + u32::from(nees < 7.815));
-        // Height and tilts are no better known than one alignment has them.
-        let sigmas = c.t_alpha_beta.covariance.sigmas();
-        assert!(sigmas[2] > 0.39 && sigmas[3].max(sigmas[4]) > 0.079, "{sigmas}");
-    }
-    let (anees, inside) = (sum / runs as f64, f64::from(inside) / runs as f64);
-    println!("ANEES {anees:.3} of 3, {:.1} % inside the 95 % ellipsoid", 100.0 * inside);
-    assert!((2.8 * 0.95..3.2 * 1.1).contains(&anees), "ANEES {anees} of 3");
-    assert!((0.92..0.98).contains(&inside), "{inside} inside the 95 % ellipsoid");
-}
-
-#[test]
-fn what_leaves_the_plane_is_decided_in_space() {
-    let flat = World::planar(3, draw(4, 0, 4));
-    let planar = |w: &World| planar::is_planar(&w.alpha, &w.beta, &w.alignments);
-    assert!(planar(&flat) && !planar(&World::new(3, draw(4, 0, 4))));
-    let tilted_by = |roll: f64| Vector6::new(0.0, 0.0, 0.0, roll, 0.0, 0.0);
-    for nudge in [Vector6::z() * 1e-3, tilted_by(1e-3), tilted_by(core::f64::consts::PI)] {
-        let mut w = flat.clone();
-        w.alignments[2].t_i_j.pose = w.alignments[2].t_i_j.pose.retract(&nudge);
-        assert!(!planar(&w), "{nudge}");
-    }
-    let mut w = flat.clone();
-    let mut tied = *w.alignments[2].t_i_j.covariance.matrix();
-    (tied[(0, 2)], tied[(2, 0)]) = (0.01, 0.01);
-    w.alignments[2].t_i_j.covariance = Covariance::new(tied).unwrap();
-    assert!(!planar(&w));
-    let mut w = flat;
-    w.beta.push(PoseWithCovariance {
-        pose: Se3::exp(&Vector6::new(1.0, 0.0, 0.1, 0.0, 0.0, 0.0)),
-        covariance: Covariance::from_sigmas([0.1; 6]).unwrap(),
-    });
-    assert!(!planar(&w));
 }
 
 #[test]

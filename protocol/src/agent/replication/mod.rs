@@ -4,6 +4,7 @@
 //! What an entry or an answer calls for elsewhere in the agent is handed back to who called; nothing else is reached
 //! from here.
 
+mod answers;
 pub(super) mod beacons;
 pub(super) mod blobs;
 mod condensing;
